@@ -1,0 +1,52 @@
+"""Deep Compliant Control (Lee, Chang, Lee, SIGGRAPH 2022) in JAX and MuJoCo MJX.
+
+Importing this package imports nothing else: jax and MuJoCo come with the first use of
+a name below.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import types
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from dcc_jax.config import make_config
+    from dcc_jax.control.stiffness import stiffness
+    from dcc_jax.sweep import sweep
+    from dcc_jax.train import train
+
+__all__ = ["make_config", "stiffness", "sweep", "train"]
+
+_HOMES = {
+    "make_config": "config",
+    "train": "train",
+    "sweep": "sweep",
+    "stiffness": "control.stiffness",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'dcc_jax' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"dcc_jax.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__all__]
+
+
+class _Package(types.ModuleType):
+    """Keeps `dcc_jax.train` the function when the module of that name is imported.
+
+    Python binds an imported submodule in its package; `from dcc_jax.train import main`
+    works all the same.
+    """
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not (name in _HOMES and isinstance(value, types.ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

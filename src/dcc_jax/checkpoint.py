@@ -1,0 +1,233 @@
+"""Whole runs on disk, and policies small enough to ship. No pickle is ever loaded.
+
+A checkpoint is `checkpoints/000000050/` (written by orbax, which renames a finished
+directory into place) and `checkpoints/000000050.sha256`, a digest of every file in it.
+Without its digests a checkpoint is one that was being written when the run was killed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+
+from dcc_jax.learn.networks import Layer
+from dcc_jax.learn.normalizer import Normalizer
+from dcc_jax.learn.rollout import Policy
+
+_FOLDER = "checkpoints"
+_DIGEST = ".sha256"
+
+
+class CheckpointError(RuntimeError):
+    """A checkpoint could not be written, or none can be read."""
+
+
+def save(run_dir: Path, update: int, state: Any, keep: int) -> Path:
+    """Writes a checkpoint, then removes all but the newest `keep`.
+
+    Args:
+        run_dir: of the run.
+        update: how many updates the state has seen; names the checkpoint.
+        state: any pytree of arrays and random keys.
+        keep: checkpoints that stay.
+
+    Raises:
+        CheckpointError: it could not be written; the earlier ones are as they were.
+    """
+    path = run_dir / _FOLDER / f"{update:09d}"
+    try:
+        _remove(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        ocp.PyTreeCheckpointer().save(path.absolute(), to_arrays(state))
+        write_atomically(_digest_file(path), json.dumps(_digests(path)).encode())
+    # orbax raises whatever its storage library does: OSError, ValueError, its own.
+    except Exception as error:
+        _discard(path)
+        reason = str(error).strip().splitlines() or [type(error).__name__]
+        raise CheckpointError(
+            f"cannot write checkpoint {path}: {reason[0]}; earlier ones are intact"
+        ) from error
+    for old in available(run_dir)[keep:]:
+        _remove(run_dir / _FOLDER / f"{old:09d}")
+    return path
+
+
+def available(run_dir: Path) -> list[int]:
+    """Updates of the checkpoints that were finished, newest first."""
+    found = (run_dir / _FOLDER).glob(f"*{_DIGEST}")
+    return sorted((int(f.stem) for f in found if f.stem.isdecimal()), reverse=True)
+
+
+def restore_latest(
+    run_dir: Path, template: Any, say: Callable[[str], None]
+) -> tuple[int, Any] | None:
+    """The newest readable checkpoint as (update, state), or None where there is none.
+
+    Args:
+        run_dir: of the run.
+        template: a state (or its shapes) of the same structure.
+        say: told about every damaged checkpoint that is passed over.
+
+    Raises:
+        CheckpointError: there are checkpoints, and all are damaged.
+        ValueError: the state has another shape than the template.
+    """
+    updates = available(run_dir)
+    for update in updates:
+        path = run_dir / _FOLDER / f"{update:09d}"
+        try:
+            arrays = _read(path)
+        except CheckpointError as error:
+            say(f"skipping damaged checkpoint {path}: {error}")
+            continue
+        return update, from_arrays(arrays, template)
+    if updates:
+        raise CheckpointError(f"every checkpoint in {run_dir / _FOLDER} is damaged")
+    return None
+
+
+def to_arrays(tree: Any) -> dict[str, np.ndarray]:
+    """Every leaf as a host array by its path, random keys as their data."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {_name(path): np.asarray(_raw(leaf)) for path, leaf in leaves}
+
+
+def from_arrays(arrays: dict[str, np.ndarray], template: Any) -> Any:
+    """The inverse of `to_arrays`; leaves are host arrays and random keys.
+
+    Raises:
+        ValueError: names or shapes differ from the template's.
+    """
+    leaves, tree = jax.tree_util.tree_flatten_with_path(template)
+    named = [(_name(path), leaf) for path, leaf in leaves]
+    missing = sorted({name for name, _ in named} ^ arrays.keys())
+    if missing:
+        raise ValueError(f"the checkpoint does not fit this run: {missing[0]}")
+    restored = [_restored(name, arrays[name], leaf) for name, leaf in named]
+    return jax.tree_util.tree_unflatten(tree, restored)
+
+
+def save_policy(directory: Path, policy: Policy) -> Path:
+    """Writes `policy.npz`, a few hundred kB, replacing an older one atomically."""
+    path = directory / "policy.npz"
+    partial = directory / "policy.partial.npz"
+    np.savez(partial, **to_arrays(policy))  # pyright: ignore[reportArgumentType]
+    os.replace(partial, path)
+    return path
+
+
+def load_policy(directory: Path) -> Policy:
+    """The policy in a run directory or one that ships with the package.
+
+    Raises:
+        ValueError: there is no `policy.npz`, or it is damaged.
+    """
+    path = Path(directory) / "policy.npz"
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        count = sum(name.endswith(".kernel") for name in arrays)
+        normalizer = {
+            field: arrays[f"normalizer.{field}"]
+            for field in Normalizer.__dataclass_fields__
+        }
+        return Policy(
+            params=tuple(
+                Layer(
+                    kernel=arrays[f"params.{i}.kernel"],
+                    bias=arrays[f"params.{i}.bias"],
+                )
+                for i in range(count)
+            ),
+            normalizer=Normalizer(**normalizer),
+        )
+    except FileNotFoundError:
+        raise ValueError(f"{directory} holds no policy.npz") from None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path} is damaged: {error}") from None
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Replaces a file at once: a reader sees the old content or the new, never half."""
+    partial = path.with_name(path.name + ".partial")
+    with partial.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(partial, path)
+
+
+def _read(path: Path) -> dict[str, np.ndarray]:
+    try:
+        expected = json.loads(_digest_file(path).read_text())
+        actual = _digests(path)
+        changed = sorted(k for k in expected | actual if expected[k] != actual[k])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CheckpointError(f"a file is missing or unreadable: {error}") from None
+    if changed:
+        raise CheckpointError(f"{changed[0]} is not what was written")
+    try:
+        return ocp.PyTreeCheckpointer().restore(path.absolute())
+    except Exception as error:
+        raise CheckpointError(f"orbax cannot read it: {error}") from error
+
+
+def _digests(path: Path) -> dict[str, str]:
+    files = sorted(file for file in path.rglob("*") if file.is_file())
+    return {
+        str(file.relative_to(path)): hashlib.sha256(file.read_bytes()).hexdigest()
+        for file in files
+    }
+
+
+def _digest_file(path: Path) -> Path:
+    return path.with_name(path.name + _DIGEST)
+
+
+def _remove(path: Path) -> None:
+    # Digests first: what is left of a kill in between does not count as a checkpoint.
+    _digest_file(path).unlink(missing_ok=True)
+    if path.exists():
+        shutil.rmtree(path)
+
+
+def _discard(path: Path) -> None:
+    """Clears away what a failed write left, orbax's own directories included."""
+    for left in path.parent.glob(f"{path.name}*"):
+        if left.is_dir():
+            shutil.rmtree(left, ignore_errors=True)
+        else:
+            left.unlink(missing_ok=True)
+
+
+def _name(path: Any) -> str:
+    return jax.tree_util.keystr(path, simple=True, separator=".")
+
+
+def _is_key(leaf: Any) -> bool:
+    return jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _raw(leaf: Any) -> Any:
+    return jax.random.key_data(leaf) if _is_key(leaf) else leaf
+
+
+def _restored(name: str, array: np.ndarray, like: Any) -> Any:
+    if _is_key(like):
+        return jax.random.wrap_key_data(array)
+    if array.shape != like.shape:
+        raise ValueError(
+            f"the checkpoint does not fit this run: {name} has shape "
+            f"{array.shape}, not {like.shape}"
+        )
+    return array.astype(like.dtype, copy=False)

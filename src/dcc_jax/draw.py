@@ -1,0 +1,212 @@
+"""Pictures of a MuJoCo model along a motion, and videos of them.
+
+MuJoCo's offscreen renderer draws where OpenGL works (`MUJOCO_GL=osmesa` or `egl`);
+elsewhere matplotlib draws the shapes of the bodies.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from ctypes.util import find_library
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from dcc_jax.draw_plain import Camera, plain_frames
+
+Arrow = tuple[np.ndarray, np.ndarray]
+"""A force arrow: the point it acts on and the vector to draw, both [3], world, m."""
+
+GHOST = np.array([0.35, 0.75, 0.95, 0.35], np.float32)
+ARROW = np.array([0.95, 0.35, 0.10, 1.0], np.float32)
+ARROW_WIDTH = 0.018  # m
+_said_fallback = False
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera that follows the character: angles in degrees, distance in m."""
+
+    azimuth: float = 130.0  # 90 looks along +y, 180 along -x
+    elevation: float = -12.0
+    distance: float = 3.4
+    height: float = 0.85  # of the point looked at, above the ground
+    body: str | None = "pelvis"  # whose ground position is followed; None: stand still
+    target: tuple[float, float] = (0.0, 0.0)  # where to look when nothing is followed
+    smooth: float = 6.0  # frames, of the following
+
+
+def frames(
+    model: mujoco.MjModel,
+    qpos: np.ndarray,
+    *,
+    camera: View | None = None,
+    size: tuple[int, int] = (640, 480),
+    ghost_qpos: np.ndarray | None = None,
+    arrows: Sequence[Sequence[Arrow]] | None = None,
+    fallback: bool | None = None,
+) -> Iterator[np.ndarray]:
+    """Draws one picture a pose.
+
+    Args:
+        model: the scene.
+        qpos: its coordinates [T, nq].
+        camera: from where; the default follows the pelvis from the front left.
+        size: width and height in pixels.
+        ghost_qpos: a second, translucent copy of the moving bodies [T, nq].
+        arrows: per frame, the force arrows to draw.
+        fallback: draw with matplotlib (True), with OpenGL (False), or with what works.
+
+    Yields:
+        images [height, width, 3] uint8.
+
+    Raises:
+        ValueError: shapes that do not match the model or one another.
+    """
+    qpos = np.asarray(qpos, float)
+    _check("qpos", qpos, model.nq, len(qpos))
+    if ghost_qpos is not None:
+        _check("ghost_qpos", np.asarray(ghost_qpos), model.nq, len(qpos))
+    if arrows is not None and len(arrows) != len(qpos):
+        raise ValueError(f"arrows has {len(arrows)} frames, qpos has {len(qpos)}")
+    view = View() if camera is None else camera
+    if fallback is None:
+        fallback = not opengl_works()
+    looked_at = _follow(model, qpos, view)
+    ghost = None if ghost_qpos is None else np.asarray(ghost_qpos, float)
+    if not fallback:
+        return _opengl_frames(model, qpos, view, looked_at, size, ghost, arrows)
+    angles = (view.azimuth, view.elevation, view.distance)
+    cameras = [Camera(point, *angles, size) for point in looked_at]
+    return plain_frames(model, qpos, cameras, ghost, arrows, (GHOST, ARROW))
+
+
+def _check(name: str, q: np.ndarray, nq: int, count: int) -> None:
+    if q.ndim != 2 or q.shape != (count, nq):
+        raise ValueError(f"{name} must have shape ({count}, {nq}), got {q.shape}")
+
+
+def opengl_works() -> bool:
+    """Whether MuJoCo can draw offscreen here; says so once when it cannot."""
+    global _said_fallback
+    _choose_backend()
+    try:
+        probe = mujoco.MjModel.from_xml_string("<mujoco><worldbody/></mujoco>")
+        mujoco.Renderer(probe, 8, 8).close()
+        return True
+    except Exception as error:  # every GL backend fails with a type of its own
+        if not _said_fallback:
+            print(f"no OpenGL here ({error}): drawing with matplotlib", file=sys.stderr)
+            _said_fallback = True
+        return False
+
+
+def _choose_backend() -> None:
+    """Picks a headless OpenGL when none was chosen and there is no display.
+
+    MuJoCo reads MUJOCO_GL when it is imported, so its choice has to be made again.
+    """
+    if sys.platform != "linux":
+        return
+    if "MUJOCO_GL" in os.environ or os.environ.get("DISPLAY"):
+        return
+    os.environ["MUJOCO_GL"] = "osmesa" if find_library("OSMesa") else "egl"
+    renderer = sys.modules[mujoco.Renderer.__module__]
+    with contextlib.suppress(Exception):
+        importlib.reload(renderer.gl_context)
+
+
+def _follow(model: mujoco.MjModel, qpos: np.ndarray, view: View) -> np.ndarray:
+    """The point [T, 3] the camera looks at."""
+    path = np.broadcast_to([*view.target, view.height], (len(qpos), 3)).copy()
+    if view.body is not None:
+        data = mujoco.MjData(model)
+        body = model.body(view.body).id
+        for index, q in enumerate(qpos):
+            data.qpos[:] = q
+            mujoco.mj_kinematics(model, data)
+            path[index, :2] = data.xpos[body, :2]
+    return gaussian_filter1d(path, view.smooth, axis=0, mode="nearest")
+
+
+def _opengl_frames(
+    model: mujoco.MjModel,
+    qpos: np.ndarray,
+    view: View,
+    looked_at: np.ndarray,
+    size: tuple[int, int],
+    ghost: np.ndarray | None,
+    arrows: Sequence[Sequence[Arrow]] | None,
+) -> Iterator[np.ndarray]:
+    width, height = size
+    model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
+    model.vis.global_.offheight = max(model.vis.global_.offheight, height)
+    data, second = mujoco.MjData(model), mujoco.MjData(model)
+    camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
+    camera.azimuth, camera.elevation = view.azimuth, view.elevation
+    camera.distance = view.distance
+    with mujoco.Renderer(model, height, width, max_geom=4000) as renderer:
+        for index, q in enumerate(qpos):
+            data.qpos[:] = q
+            mujoco.mj_forward(model, data)
+            camera.lookat[:] = looked_at[index]
+            renderer.update_scene(data, camera, option)
+            if ghost is not None:
+                second.qpos[:] = ghost[index]
+                _add_ghost(model, second, option, renderer.scene)
+            for point, vector in arrows[index] if arrows is not None else ():
+                _add_arrow(renderer.scene, np.asarray(point), np.asarray(vector))
+            yield renderer.render().copy()
+
+
+def _add_ghost(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    option: mujoco.MjvOption,
+    scene: mujoco.MjvScene,
+) -> None:
+    mujoco.mj_forward(model, data)
+    first = scene.ngeom
+    dynamic = mujoco.mjtCatBit.mjCAT_DYNAMIC
+    mujoco.mjv_addGeoms(model, data, option, mujoco.MjvPerturb(), int(dynamic), scene)
+    for geom in scene.geoms[first : scene.ngeom]:
+        geom.rgba[:] = GHOST
+        geom.matid = -1
+
+
+def _add_arrow(scene: mujoco.MjvScene, point: np.ndarray, vector: np.ndarray) -> None:
+    if scene.ngeom >= scene.maxgeom or np.linalg.norm(vector) < 1e-3:
+        return
+    geom = scene.geoms[scene.ngeom]
+    kind = mujoco.mjtGeom.mjGEOM_ARROW
+    mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), ARROW)
+    mujoco.mjv_connector(geom, kind, ARROW_WIDTH, point, point + vector)
+    scene.ngeom += 1
+
+
+def write_mp4(path: str | Path, images: Iterator[np.ndarray], fps: float) -> None:
+    """Writes images [height, width, 3] uint8 as an H.264 video.
+
+    Raises:
+        ModuleNotFoundError: the `video` extra is not installed.
+    """
+    try:
+        import imageio.v2 as imageio
+        import imageio_ffmpeg  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            f"writing {path} needs {error.name}: pip install 'dcc-jax[video]'"
+        ) from None
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    with imageio.get_writer(
+        path, fps=fps, codec="libx264", quality=8, macro_block_size=2
+    ) as writer:
+        for image in images:
+            writer.append_data(image)

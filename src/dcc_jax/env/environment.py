@@ -1,0 +1,441 @@
+"""One environment: forces, compliance, PD, physics, features, rewards.
+
+A control step is `control_steps` physics steps of
+
+    kinematics -> PD torques (Eq. 2) -> MJX -> external forces -> u (Alg. 1) -> advance,
+
+then the state (Sec. 4.2), the positional and the task reward (Eq. 14), and whether the
+episode ends. It knows no task and no discriminator; both come from outside.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dcc_jax import physics, quat
+from dcc_jax.character import Character, compose_scene
+from dcc_jax.control import compliance, pd
+from dcc_jax.control.compliance import ComplianceConfig, Displacement
+from dcc_jax.env import features, rewards
+from dcc_jax.env.rewards import RewardConfig
+from dcc_jax.env.task import Forces, Task
+from dcc_jax.motion.reference import References, RefState
+
+Array = jax.Array
+
+CONTROL_RATE = 30  # Hz, Sec. 5.1
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """Physics, episodes, the level of compliance.
+
+    Raises:
+        ValueError: a value out of its range.
+    """
+
+    physics_rate: int = 240
+    """Physics steps a second, a multiple of 30; the paper has 600 (Sec. 5.1). 240 is
+    stable with the implicit PD (docs/performance.md)."""
+
+    newton_iterations: int = 4
+    """Of the contact solver (docs/performance.md)."""
+
+    alpha: float = 0.16
+    """Level of compliance, in [0, 1] (Sec. 5.2 mostly uses 0.16)."""
+
+    alpha_max: float | None = None
+    """With it alpha is drawn from [alpha, alpha_max] in every episode and observed."""
+
+    episode_seconds: float = 10.0
+    """Episodes are truncated then."""
+
+    mass: float = 65.0
+    """Of the character, kg; gains scale with it (Sec. 5.1, 5.3)."""
+
+    displace_target: bool = True
+    """PD target a (+) u; without, a alone, as Sec. 4 can also be read."""
+
+    fall_height: float = 0.55
+    """m; with the pelvis lower than this above the ground, the character has fallen."""
+
+    limb_clearance: float = 0.10
+    """m; a body other than shins and feet whose origin comes so close to the ground has
+    touched it."""
+
+    clips: tuple[str, ...] = ()
+    """Paths of motion clips; empty: those of the package for this task."""
+
+    compliance: ComplianceConfig = field(default_factory=ComplianceConfig)
+    reward: RewardConfig = field(default_factory=RewardConfig)
+
+    def __post_init__(self) -> None:
+        if self.physics_rate < 60 or self.physics_rate % CONTROL_RATE:
+            raise ValueError(
+                "env.physics_rate must be a multiple of 30, 60 or more, got "
+                f"{self.physics_rate}"
+            )
+        if not 0.0 <= self.alpha <= 1.0:
+            raise ValueError(f"env.alpha must be in [0, 1], got {self.alpha}")
+        if self.alpha_max is not None and not self.alpha <= self.alpha_max <= 1.0:
+            raise ValueError(
+                f"env.alpha_max must be in [alpha, 1], got {self.alpha_max}"
+            )
+        if not self.episode_seconds > 0.1:
+            raise ValueError(
+                f"env.episode_seconds must be more than 0.1, got {self.episode_seconds}"
+            )
+
+    @property
+    def control_steps(self) -> int:
+        """Physics steps of a control step."""
+        return self.physics_rate // CONTROL_RATE
+
+
+@flax.struct.dataclass
+class Metrics:
+    """Of one control step, measured at the physics rate."""
+
+    force_peak: Array  # [] N, largest force fed to the compliance
+    impulse: Array  # [] N s, of those forces
+    torque_rms: Array  # [] N m, over joints and substeps
+    displacement: Array  # [] rad, norm of log u over the joints
+    root_displacement: Array  # [] m, of u
+
+
+@flax.struct.dataclass
+class EnvState:
+    """Everything that ONE environment carries, and what the learner reads of it."""
+
+    obs: Array  # [O]
+    features: Array  # [270] s' of the discriminator
+    previous_features: Array  # [270] s
+    condition: Array  # [0]
+    r_p: Array  # []
+    r_task: Array  # []
+    terminated: Array  # [] bool
+    truncated: Array  # [] bool
+    nan: Array  # [] bool
+    metrics: Metrics
+    body: physics.State
+    displacement: Displacement  # of the character
+    u_previous: Array  # [55] one control step ago
+    q_previous: Array  # [55] the character's coordinates then
+    origin: Array  # [2] m, where the root of the reference stays
+    alpha: Array  # []
+    time: Array  # [] s since the reset
+    task: Any
+
+
+@flax.struct.dataclass
+class _Substep:
+    """Carried through the physics steps of one control step."""
+
+    body: physics.State
+    displacement: Displacement
+    task: Any
+    time: Array
+    force_peak: Array
+    impulse: Array
+    torque_square: Array
+
+
+class Environment:
+    """Static parts of one task's environment; its methods are pure."""
+
+    def __init__(
+        self,
+        task: Task,
+        character: Character,
+        references: References,
+        config: EnvConfig,
+    ) -> None:
+        self.task = task
+        self.config = config
+        self.references = references
+        model = compose_scene(
+            character,
+            timestep=1.0 / config.physics_rate,
+            floor=task.has_floor,
+            extend=task.extend,
+        )
+        self.scene = physics.make_scene(
+            model, character, newton_iterations=config.newton_iterations
+        )
+        alone = compose_scene(character, floor=False)
+        self.kinematics = features.Kinematics.of(alone)
+        self.nominal = _nominal_pose(references)
+        self.return_stiffness = compliance.return_stiffness(
+            config.compliance, character.nv
+        )
+        names = [character.body_names[i] for i in range(len(character.body_names))]
+        self.limbs = np.array(
+            [i for i, n in enumerate(names) if not n.endswith(("foot", "shin"))]
+        )
+
+    action_size = property(lambda self: 36 + self.task.extra_actions)
+    observation_size = property(lambda self: 270 + 36 + 3 + 1 + self.task.state_size)
+    feature_size = property(lambda self: 270)
+    condition_size = property(lambda self: 0)
+    has_task_reward = property(lambda self: self.task.has_reward)
+    control_dt = 1.0 / CONTROL_RATE
+
+    def reset(self, key: Array, alpha: Array | None = None) -> EnvState:
+        """A new episode at a moment of the reference (Reference State Initialization).
+
+        Args:
+            key: consumed.
+            alpha: level of compliance; None draws what the configuration says.
+        """
+        reference_key, task_key, alpha_key = jax.random.split(key, 3)
+        reference = self.references.sample(reference_key)
+        reference = _at_origin(reference)
+        task, qpos, qvel = self.task.reset(task_key, self.scene, reference)
+        body = physics.initial_state(self.scene, qpos, qvel)
+        displacement = compliance.at_rest(self.kinematics.coords)
+        zero = jnp.zeros(())
+        state = EnvState(
+            obs=jnp.zeros(self.observation_size),
+            features=jnp.zeros(self.feature_size),
+            previous_features=jnp.zeros(self.feature_size),
+            condition=jnp.zeros(0),
+            r_p=zero,
+            r_task=zero,
+            terminated=jnp.zeros((), bool),
+            truncated=jnp.zeros((), bool),
+            nan=jnp.zeros((), bool),
+            metrics=Metrics(zero, zero, zero, zero, zero),
+            body=body,
+            displacement=displacement,
+            u_previous=displacement.u,
+            q_previous=reference.qpos_previous,
+            origin=reference.qpos[:2],
+            alpha=self._alpha(alpha_key) if alpha is None else jnp.asarray(alpha),
+            time=zero,
+            task=task,
+        )
+        return self._observed(state)
+
+    def step(self, key: Array, state: EnvState, action: Array) -> EnvState:
+        """One control step.
+
+        Args:
+            key: consumed; what the surroundings draw.
+            state: of this environment.
+            action: rotation vectors of the 12 joints from the nominal pose [36], rad,
+                then the task's extra actions.
+        """
+        task, body = self.task.control_step(key, self.scene, state.task, state.body)
+        zero = jnp.zeros(())
+        start = _Substep(body, state.displacement, task, state.time, zero, zero, zero)
+        end, _ = jax.lax.scan(
+            lambda carry, _: (self._substep(carry, action, state.alpha), None),
+            start,
+            None,
+            length=self.config.control_steps,
+        )
+        new = state.replace(
+            body=end.body,
+            displacement=end.displacement,
+            task=end.task,
+            time=end.time,
+            q_previous=self.scene.character_qpos(state.body.qpos),
+            u_previous=state.displacement.u,
+            previous_features=state.features,
+            metrics=self._metrics(end),
+        )
+        new = self._judged(self._observed(new))
+        return _contained(new, state)
+
+    def expert_pairs(self, key: Array, n: int) -> tuple[Array, Array, Array]:
+        """(s, s') ~ M: features [n, 270] twice, and the condition [n, 0]."""
+        windows = self.references.sample_windows(key, n)
+        pair = jax.vmap(lambda q, before: self._features(q, before))
+        return (
+            pair(windows[:, 1], windows[:, 0]),
+            pair(windows[:, 2], windows[:, 1]),
+            jnp.zeros((n, 0)),
+        )
+
+    def _features(self, q: Array, q_previous: Array) -> Array:
+        return features.body_features(self.kinematics, q, q_previous)
+
+    def _alpha(self, key: Array) -> Array:
+        low, high = self.config.alpha, self.config.alpha_max
+        if high is None:
+            return jnp.asarray(low)
+        return jax.random.uniform(key, minval=low, maxval=high)
+
+    def _substep(self, carry: _Substep, action: Array, alpha: Array) -> _Substep:
+        scene, task = self.scene, self.task
+        world = task.world(scene, carry.task, carry.time)
+        kin = physics.kinematics(scene, carry.body, world)
+        tau = self._torque(carry, action)
+        qfrc = scene.scatter_character(tau)
+        qfrc = qfrc + task.applied(scene, carry.task, carry.time)
+        solution = physics.solve(scene, kin, carry.body, qfrc)
+        task_state, forces = task.forces(scene, carry.task, kin, solution, action)
+        displacement = self._displaced(carry, kin, forces, alpha)
+        size = jnp.sqrt(jnp.sum(jnp.square(forces.force_w)) + 1e-12)
+        return _Substep(
+            body=physics.integrate(scene, carry.body, solution),
+            displacement=displacement,
+            task=task_state,
+            time=carry.time + scene.timestep,
+            force_peak=jnp.maximum(carry.force_peak, size),
+            impulse=carry.impulse + scene.timestep * size,
+            torque_square=carry.torque_square + jnp.mean(jnp.square(tau[6:])),
+        )
+
+    def _torque(self, carry: _Substep, action: Array) -> Array:
+        target = quat.oplus(self.kinematics.coords, self.nominal, self._offset(action))
+        if self.config.displace_target:
+            target = quat.oplus(self.kinematics.coords, target, carry.displacement.u)
+        scene = self.scene
+        return pd.torque(
+            scene.character,
+            scene.character_qpos(carry.body.qpos),
+            scene.character_qvel(carry.body.qvel),
+            target,
+            scene.timestep,
+        )
+
+    def _offset(self, action: Array) -> Array:
+        tangent = jnp.concatenate([jnp.zeros(6, action.dtype), action[:36]])
+        return quat.exp_map(self.kinematics.coords, tangent)
+
+    def _displaced(
+        self, carry: _Substep, kin: physics.Kinematics, forces: Forces, alpha: Array
+    ) -> Displacement:
+        """Alg. 1 for one physics step."""
+        scene, config = self.scene, self.config.compliance
+        jacobian = jax.vmap(lambda p, b: physics.point_jacobian(scene, kin, p, b))
+        J = jacobian(forces.point_w, forces.body)
+        force = jnp.where(forces.gate, forces.force_w, 0.0)
+        if config.velocity == "forward_dynamics":
+            qfrc = jnp.sum(J * force[:, :, None], axis=1)
+            motion = scene.character_qvel(physics.mass_solve(scene, kin, qfrc))
+        else:
+            weights = jnp.asarray(scene.character.column_weight, J.dtype)
+            acts = jnp.any(force != 0.0, axis=-1, keepdims=True)
+            qvel = scene.character_qvel(carry.body.qvel)
+            motion = acts * compliance.point_velocity(
+                scene.character_qvel(J), qvel, weights
+            )
+        ud = compliance.displacement_velocity(
+            scene.character_qvel(J),
+            motion,
+            alpha,
+            jnp.asarray(scene.character.column_weight, J.dtype),
+            config,
+        )
+        return compliance.advance(
+            self.kinematics.coords,
+            carry.displacement,
+            ud,
+            compliance.acting(force),
+            scene.timestep,
+            self.return_stiffness,
+        )
+
+    def _observed(self, state: EnvState) -> EnvState:
+        """Fills in the features and the observation."""
+        q = self.scene.character_qpos(state.body.qpos)
+        numbers = features.state(
+            self.kinematics, q, state.q_previous, state.displacement.u, state.u_previous
+        )
+        _, heading = features.local_frame(q)
+        offset = jnp.concatenate([state.origin, jnp.zeros(1)])
+        target = offset + state.displacement.u[:3] - q[:3]
+        target = quat.rotate(quat.inv(heading), target * jnp.array([1.0, 1.0, 0.0]))
+        obs = jnp.concatenate(
+            [
+                numbers,
+                target,
+                state.alpha[None],
+                self.task.observe(self.scene, state.task, state.body),
+            ]
+        )
+        first = state.time == 0.0
+        body_features = numbers[:270]
+        return state.replace(
+            obs=obs,
+            features=body_features,
+            previous_features=jnp.where(first, body_features, state.previous_features),
+        )
+
+    def _judged(self, state: EnvState) -> EnvState:
+        """Fills in rewards and endings."""
+        scene, config = self.scene, self.config
+        q = scene.character_qpos(state.body.qpos)
+        qd = scene.character_qvel(state.body.qvel)
+        r_p = rewards.position_reward(
+            q[:2] - state.origin,
+            qd[:2],
+            state.displacement.u[:2],
+            state.displacement.ud[:2],
+            config.reward,
+        )
+        ground = self.task.ground_height(scene, state.task, state.body)
+        pos_w, _ = features.body_poses(self.kinematics, q)
+        fallen = (q[2] < ground + config.fall_height) | jnp.any(
+            pos_w[self.limbs, 2] < ground + config.limb_clearance
+        )
+        failed = self.task.terminated(scene, state.task, state.body)
+        return state.replace(
+            r_p=r_p,
+            r_task=self.task.reward(scene, state.task, state.body),
+            terminated=fallen | failed,
+            truncated=state.time >= config.episode_seconds - 1e-4,
+        )
+
+    def _metrics(self, end: _Substep) -> Metrics:
+        u = quat.log_map(self.kinematics.coords, end.displacement.u)
+        return Metrics(
+            force_peak=end.force_peak,
+            impulse=end.impulse,
+            torque_rms=jnp.sqrt(end.torque_square / self.config.control_steps),
+            displacement=jnp.sqrt(jnp.sum(jnp.square(u[6:])) + 1e-12),
+            root_displacement=jnp.sqrt(jnp.sum(jnp.square(u[:3])) + 1e-12),
+        )
+
+
+def _nominal_pose(references: References) -> Array:
+    """The pose [55] that the zero action asks for: mean joint rotations of the clips.
+
+    Departure: the paper's action is q_bar itself. Around the mean pose the untrained
+    policy stands about like the clips do, and the rotation vectors stay small.
+    """
+    frames = (
+        np.arange(references.qpos.shape[1]) < np.asarray(references.frames)[:, None]
+    )
+    tangents = quat.log_map(references.coords, references.qpos)
+    weight = frames[..., None] / frames.sum()
+    mean = jnp.sum(weight * tangents, axis=(0, 1)).at[:6].set(0.0)
+    return quat.exp_map(references.coords, mean)
+
+
+def _at_origin(reference: RefState) -> RefState:
+    """The same moment with the root over the world's origin."""
+    shift = reference.qpos * jnp.zeros(55).at[:2].set(1.0)
+    return reference.replace(
+        qpos=reference.qpos - shift, qpos_previous=reference.qpos_previous - shift
+    )
+
+
+def _contained(new: EnvState, old: EnvState) -> EnvState:
+    """`new`, or where a number of it is not finite, `old` as a terminated state."""
+    leaves = [x for x in jax.tree.leaves(new) if jnp.issubdtype(x.dtype, jnp.inexact)]
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in leaves]))
+    kept = jax.tree.map(lambda n, o: jnp.where(finite, n, o), new, old)
+    return kept.replace(
+        terminated=kept.terminated | ~finite,
+        truncated=kept.truncated & finite,
+        nan=~finite,
+    )

@@ -1,0 +1,124 @@
+"""What a task is: a scene and a few pure functions of ONE environment.
+
+A task is a frozen dataclass that derives from `Task` and overrides what it needs; the
+defaults describe a character alone on the floor. `docs/tasks.md` walks through one.
+Letters: F forces the compliance reacts to, S numbers of the task's own state vector.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import mujoco
+
+from dcc_jax import physics
+from dcc_jax.motion.reference import RefState
+
+Array = jax.Array
+
+
+@flax.struct.dataclass
+class Forces:
+    """External forces for the compliance controller, F a task's own number."""
+
+    force_w: Array  # [F, 3] N, world, on the character; exactly zero: none acts
+    point_w: Array  # [F, 3] m, where it acts
+    body: Array  # [F] int32, id of the character's body in the scene
+    gate: Array  # [] bool, whether the controller listens
+
+
+@flax.struct.dataclass
+class Nothing:
+    """The state of a task that has none."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """The contract. `scene` is static; `state` is the task's own pytree."""
+
+    name: ClassVar[str] = ""
+    clips: ClassVar[tuple[str, ...]] = ("stand",)
+    """Assets in `assets/motions` that a fresh install trains on."""
+    has_reward: ClassVar[bool] = False
+    extra_actions: ClassVar[int] = 0
+    state_size: ClassVar[int] = 0
+
+    def extend(self, spec: mujoco.MjSpec) -> None:
+        """Adds bodies and contact pairs to the scene of character and floor."""
+
+    @property
+    def has_floor(self) -> bool:
+        """Whether the soles stand on the ground plane."""
+        return True
+
+    def reset(
+        self, key: Array, scene: physics.Scene, reference: RefState
+    ) -> tuple[Any, Array, Array]:
+        """The task's state, and qpos [nq] and qvel [nv] of the whole scene."""
+        return Nothing(), *place_character(scene, reference)
+
+    def control_step(
+        self, key: Array, scene: physics.Scene, state: Any, body: physics.State
+    ) -> tuple[Any, physics.State]:
+        """What happens once a control step, before the physics: throws, schedules."""
+        return state, body
+
+    def applied(self, scene: physics.Scene, state: Any, time: Array) -> Array:
+        """Generalized forces of the surroundings on the scene [nv], every substep."""
+        return jnp.zeros(scene.model.nv)
+
+    def world(self, scene: physics.Scene, state: Any, time: Array) -> Any:
+        """Kinematic bodies and switches at a moment, or None: as the model has them."""
+        return None
+
+    def forces(
+        self,
+        scene: physics.Scene,
+        state: Any,
+        kin: physics.Kinematics,
+        solution: physics.Solution,
+        action: Array,
+    ) -> tuple[Any, Forces]:
+        """The forces of a substep that the compliance reacts to; may note events."""
+        raise NotImplementedError
+
+    def observe(self, scene: physics.Scene, state: Any, body: physics.State) -> Array:
+        """s_task [S], in the character's local frame."""
+        return jnp.zeros(0)
+
+    def reward(self, scene: physics.Scene, state: Any, body: physics.State) -> Array:
+        """r_task, where the task has one."""
+        return jnp.zeros(())
+
+    def terminated(
+        self, scene: physics.Scene, state: Any, body: physics.State
+    ) -> Array:
+        """The task's own failure, beside falling."""
+        return jnp.zeros((), bool)
+
+    def ground_height(
+        self, scene: physics.Scene, state: Any, body: physics.State
+    ) -> Array:
+        """Height in m of what the character stands on, for the fall test."""
+        return jnp.zeros(())
+
+
+def place_character(scene: physics.Scene, reference: RefState) -> tuple[Array, Array]:
+    """qpos and qvel of the scene at rest with the character at a reference state."""
+    qpos = jnp.asarray(scene.model.qpos0, jnp.float32)
+    qpos = jax.lax.dynamic_update_slice(qpos, reference.qpos, (scene.qpos_adr,))
+    return qpos, scene.scatter_character(reference.qvel)
+
+
+def resultant(force_w: Array, point_w: Array) -> tuple[Array, Array]:
+    """One force [3] and its point [3] for contacts [C, 3] on one body.
+
+    The point is the centre of pressure: the mean of the points, weighted by |f|.
+    """
+    size = jnp.sqrt(jnp.sum(force_w * force_w, axis=-1) + 1e-12)
+    weight = size / jnp.sum(size)
+    return force_w.sum(axis=0), jnp.sum(weight[:, None] * point_w, axis=0)

@@ -1,0 +1,298 @@
+"""Environments over time and over the batch; the only auto-reset of the project.
+
+Letters: T time, B environments, O observation, A actions, F body features, C condition.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from dcc_jax.learn import networks, normalizer, ppo
+from dcc_jax.learn.discriminator import Pairs
+
+Array = jax.Array
+
+
+class EnvState(Protocol):
+    """What the learner reads of the state of one environment."""
+
+    @property
+    def obs(self) -> Array: ...  # [O]
+    @property
+    def features(self) -> Array: ...  # [F] s'
+    @property
+    def previous_features(self) -> Array: ...  # [F] s, of the same episode
+    @property
+    def condition(self) -> Array: ...  # [C]
+    @property
+    def r_p(self) -> Array: ...  # []
+    @property
+    def r_task(self) -> Array: ...  # []
+    @property
+    def terminated(self) -> Array: ...  # [] bool
+    @property
+    def truncated(self) -> Array: ...  # [] bool
+    @property
+    def nan(self) -> Array: ...  # [] bool
+    @property
+    def metrics(self) -> Any: ...  # struct of [] floats
+
+
+class Environment(Protocol):
+    """One environment: static, pure functions, no batch axis."""
+
+    # Any: a protocol cannot hold `property(lambda self: ...)` to int and bool.
+    @property
+    def observation_size(self) -> Any: ...
+    @property
+    def action_size(self) -> Any: ...
+    @property
+    def feature_size(self) -> Any: ...
+    @property
+    def condition_size(self) -> Any: ...
+    @property
+    def has_task_reward(self) -> Any: ...
+
+    def reset(self, key: Array, alpha: Array | None = None) -> Any: ...
+    def step(self, key: Array, state: Any, action: Array) -> Any: ...
+    def expert_pairs(self, key: Array, n: int) -> tuple[Array, Array, Array]: ...
+
+
+@flax.struct.dataclass
+class Policy:
+    """All that is needed to act."""
+
+    params: networks.Mlp
+    normalizer: normalizer.Normalizer
+
+    def mean(self, obs: Array) -> Array:
+        """Mean action [..., A] in rad for raw observations [..., O]."""
+        return networks.apply_mlp(
+            self.params, normalizer.normalize(self.normalizer, obs)
+        )
+
+
+@flax.struct.dataclass
+class Actors:
+    """What acts in a rollout, frozen while it lasts."""
+
+    policy: Policy
+    value: networks.Mlp
+    alpha: Array | None  # [] compliance level, or None: the environment's own
+
+
+@flax.struct.dataclass
+class Running:
+    """The environments between two rollouts."""
+
+    env: Any  # EnvState, every leaf [B, ...]
+    steps: Array  # [B] int32 control steps since the reset
+
+
+@flax.struct.dataclass
+class Transition:
+    """One control step of every environment."""
+
+    obs: Array  # [T, B, O] raw, before the step
+    action: Array  # [T, B, A] rad
+    log_prob: Array  # [T, B]
+    pairs: Pairs  # [T, B, ...] body features before and after
+    r_p: Array  # [T, B]
+    r_task: Array  # [T, B]
+    terminated: Array  # [T, B] bool
+    truncated: Array  # [T, B] bool
+    nan: Array  # [T, B] bool
+    final_value: Array  # [T, B] V of the last state of a truncated episode, else 0
+    length: Array  # [T, B] int32 steps of the episode that ends here, else 0
+
+
+@flax.struct.dataclass
+class Incident:
+    """The last environment that broke: its state and action just before."""
+
+    happened: Array  # [] bool
+    env: Any  # EnvState of ONE environment
+    action: Array  # [A] rad
+
+
+@flax.struct.dataclass
+class Rollout:
+    """What a rollout leaves."""
+
+    running: Running
+    transitions: Transition  # [T, B, ...]
+    env_metrics: Any  # the environment's metrics, averaged over T and B, []
+    incident: Incident
+
+
+def reset_all(keys: Array, environment: Environment, alpha: Array | None) -> Running:
+    """Fresh episodes in as many environments as there are keys, [B]."""
+    env = jax.vmap(lambda key: environment.reset(key, alpha))(keys)
+    return Running(env=env, steps=jnp.zeros(keys.shape[0], jnp.int32))
+
+
+def rollout(
+    key: Array,
+    environment: Environment,
+    actors: Actors,
+    running: Running,
+    length: int,
+    config: ppo.PpoConfig,
+    chunk: int | None = None,
+) -> Rollout:
+    """Acts for `length` control steps in every environment.
+
+    Args:
+        key: consumed.
+        environment: the functions of one environment.
+        actors: policy, value function, level of compliance.
+        running: B environments.
+        length: T.
+        config: sigma and discount.
+        chunk: environments stepped at once, a divisor of B; the rest waits, so that
+            the working set stays in a CPU's cache. None: all.
+    """
+    count = running.steps.shape[0]
+    if chunk is None or chunk >= count:
+        return _rollout(key, environment, actors, running, length, config)
+    chunks = count // chunk
+    split = jax.tree.map(lambda x: x.reshape(chunks, chunk, *x.shape[1:]), running)
+    parts: Rollout = jax.lax.map(
+        lambda part: _rollout(part[0], environment, actors, part[1], length, config),
+        (jax.random.split(key, chunks), split),
+    )
+    return _joined(parts, count)
+
+
+def _rollout(
+    key: Array,
+    environment: Environment,
+    actors: Actors,
+    running: Running,
+    length: int,
+    config: ppo.PpoConfig,
+) -> Rollout:
+    def step(
+        carry: tuple[Running, Incident], draws: tuple[Array, Array, Array]
+    ) -> tuple[tuple[Running, Incident], tuple[Transition, Any]]:
+        running, incident = carry
+        noise, step_keys, reset_keys = draws
+        mean = actors.policy.mean(running.env.obs)
+        action = mean + config.sigma * noise
+        log_prob = ppo.log_prob(mean, action, config.sigma)
+        env = jax.vmap(environment.step)(step_keys, running.env, action)
+        incident = _recorded(incident, env.nan, running.env, action)
+        transition = _transition(running, env, action, log_prob, actors, config)
+        means = jax.tree.map(jnp.mean, env.metrics)
+        running = _auto_reset(reset_keys, environment, actors, running, env)
+        return (running, incident), (transition, means)
+
+    one = jax.tree.map(lambda x: x[0], running.env)
+    nothing = Incident(
+        happened=jnp.asarray(False),
+        env=one,
+        action=jnp.zeros(environment.action_size),
+    )
+    (running, incident), (transitions, means) = jax.lax.scan(
+        step, (running, nothing), _draws(key, length, running, environment)
+    )
+    return Rollout(
+        running=running,
+        transitions=transitions,
+        env_metrics=jax.tree.map(jnp.mean, means),
+        incident=incident,
+    )
+
+
+def _draws(
+    key: Array, length: int, running: Running, environment: Environment
+) -> tuple[Array, Array, Array]:
+    """Action noise [T, B, A], step keys and reset keys [T, B], all drawn at once."""
+    count = running.steps.shape[0]
+    noise_key, env_key = jax.random.split(key)
+    noise = jax.random.normal(noise_key, (length, count, environment.action_size))
+    keys = jax.random.split(env_key, (2, length, count))
+    return noise, keys[0], keys[1]
+
+
+def _transition(
+    before: Running,
+    env: Any,
+    action: Array,
+    log_prob: Array,
+    actors: Actors,
+    config: ppo.PpoConfig,
+) -> Transition:
+    ends = env.terminated | env.truncated
+    return Transition(
+        obs=before.env.obs,
+        action=action,
+        log_prob=log_prob,
+        pairs=Pairs(
+            s=env.previous_features, s_next=env.features, condition=env.condition
+        ),
+        r_p=env.r_p,
+        r_task=env.r_task,
+        terminated=env.terminated,
+        truncated=env.truncated,
+        nan=env.nan,
+        final_value=_final_value(actors, env, config.discount),
+        length=jnp.where(ends, before.steps + 1, 0),
+    )
+
+
+def _final_value(actors: Actors, env: Any, discount: float) -> Array:
+    # Few episodes run out of time in any one step: most steps need no network at all.
+    def value(obs: Array) -> Array:
+        normalized = normalizer.normalize(actors.policy.normalizer, obs)
+        return ppo.value_of(actors.value, normalized, discount)
+
+    values = jax.lax.cond(
+        jnp.any(env.truncated), value, lambda obs: jnp.zeros(obs.shape[0]), env.obs
+    )
+    return jnp.where(env.truncated, values, 0.0)
+
+
+def _auto_reset(
+    keys: Array, environment: Environment, actors: Actors, before: Running, env: Any
+) -> Running:
+    ends = env.terminated | env.truncated
+
+    def renewed(running: Running) -> Running:
+        fresh = reset_all(keys, environment, actors.alpha)
+        return jax.tree.map(lambda new, old: _where(ends, new, old), fresh, running)
+
+    going_on = Running(env=env, steps=before.steps + 1)
+    return jax.lax.cond(jnp.any(ends), renewed, lambda running: running, going_on)
+
+
+def _recorded(incident: Incident, nan: Array, env: Any, action: Array) -> Incident:
+    def record(_: Incident) -> Incident:
+        at = jnp.argmax(nan)
+        state = jax.tree.map(lambda x: x[at], env)
+        return Incident(happened=jnp.asarray(True), env=state, action=action[at])
+
+    return jax.lax.cond(jnp.any(nan), record, lambda old: old, incident)
+
+
+def _joined(parts: Rollout, count: int) -> Rollout:
+    """Undoes the chunks, leading axis first: [chunks, T, b, ...] -> [T, B, ...]."""
+
+    def over_time(x: Array) -> Array:
+        return jnp.moveaxis(x, 0, 1).reshape(x.shape[1], count, *x.shape[3:])
+
+    broken = jnp.argmax(parts.incident.happened)
+    return Rollout(
+        running=jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), parts.running),
+        transitions=jax.tree.map(over_time, parts.transitions),
+        env_metrics=jax.tree.map(lambda x: jnp.mean(x, axis=0), parts.env_metrics),
+        incident=jax.tree.map(lambda x: x[broken], parts.incident),
+    )
+
+
+def _where(ends: Array, new: Array, old: Array) -> Array:
+    return jnp.where(ends.reshape(-1, *([1] * (new.ndim - 1))), new, old)

@@ -1,0 +1,159 @@
+"""Everything a run is, and how much of it is simulated.
+
+Letters: B environments of this device, D devices.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from dcc_jax.env.rewards import RewardConfig
+from dcc_jax.learn import networks, normalizer, ppo
+from dcc_jax.learn.discriminator import DiscriminatorConfig
+from dcc_jax.learn.ppo import PpoConfig
+from dcc_jax.learn.rollout import Environment, Incident, Running, reset_all
+
+Array = jax.Array
+AXIS = "env"  # mesh axis over which the environments are sharded
+
+_EXPERT_SAMPLE = 4096
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """How much is simulated, and what is kept."""
+
+    num_envs: int = 256
+    """Environments over all devices; 128 a core fill the cache of a CPU (measured)."""
+
+    unroll_length: int = 32
+    """Control steps of every environment in an update; the paper collects 2048 tuples
+    (Sec. 5.1)."""
+
+    chunk_size: int | None = None
+    """Environments that a device steps at once; None: 128 on a CPU, all elsewhere."""
+
+    total_tuples: int = 20_000_000
+    """Training ends after as many (s, a, r, s'); the paper has 20-80 M (Sec. 5.1)."""
+
+    checkpoint_interval: int = 50
+    """Updates between checkpoints; one is also written at the end and on a signal."""
+
+    keep_checkpoints: int = 3
+    """The last few that stay on disk."""
+
+    def __post_init__(self) -> None:
+        for name in (
+            "num_envs",
+            "unroll_length",
+            "total_tuples",
+            "checkpoint_interval",
+            "keep_checkpoints",
+        ):
+            value = getattr(self, name)
+            if value < 1:
+                raise ValueError(f"train.{name} must be 1 or more, got {value}")
+        if self.chunk_size is not None and self.chunk_size < 1:
+            raise ValueError(
+                f"train.chunk_size must be 1 or more, or None, got {self.chunk_size}"
+            )
+
+    @property
+    def tuples_per_update(self) -> int:
+        """Transitions of one update, all environments together."""
+        return self.num_envs * self.unroll_length
+
+
+class HasReward(Protocol):
+    """The part of an environment's section that the learner reads."""
+
+    @property
+    def reward(self) -> RewardConfig: ...
+
+
+class LearnerConfig(Protocol):
+    """The sections the learner reads."""
+
+    @property
+    def env(self) -> HasReward: ...
+    @property
+    def ppo(self) -> PpoConfig: ...
+    @property
+    def disc(self) -> DiscriminatorConfig: ...
+    @property
+    def train(self) -> TrainConfig: ...
+
+
+@flax.struct.dataclass
+class TrainState:
+    """Everything a run is: resuming from it continues bit for bit."""
+
+    agent: ppo.Agent
+    disc: networks.Network
+    obs_normalizer: normalizer.Normalizer  # of the policy's observation
+    feature_normalizer: normalizer.Normalizer  # of the discriminator's features
+    running: Running  # environments, [B, ...]
+    alpha: Array | None  # [] compliance of this run, or None: the environment's own
+    key: Array  # [] of all that is still to be drawn
+    update: Array  # [] int32 updates done
+    nan_count: Array  # [] int32 environments that ever broke
+    episode_length: Array  # [] mean steps of the episodes that ended last
+    fall_rate: Array  # [] share of them that ended by termination
+
+
+@flax.struct.dataclass
+class UpdateReport:
+    """What an update tells the outside."""
+
+    metrics: dict[str, Array]  # [] each
+    incident: Incident  # [D, ...]
+
+
+def init_state(
+    key: Array,
+    alpha: Array | None,
+    environment: Environment,
+    config: LearnerConfig,
+    local_envs: int,
+) -> TrainState:
+    """A run before its first update, seen from one device of the mesh axis.
+
+    Args:
+        key: the run's; consumed. Equal on all devices.
+        alpha: [] level of compliance, or None: the environment's own.
+        environment: of the task.
+        config: sizes.
+        local_envs: B.
+    """
+    key, agent_key, disc_key, reset_key, expert_key = jax.random.split(key, 5)
+    reset_keys = jax.random.split(of_device(reset_key), local_envs)
+    running = reset_all(reset_keys, environment, alpha)
+    s, _, _ = environment.expert_pairs(expert_key, _EXPERT_SAMPLE)
+    width = 2 * environment.feature_size + environment.condition_size
+    disc = networks.init_mlp(disc_key, (width, *config.disc.hidden, 1))
+    optimizer = networks.clipped_adam(config.disc.max_gradient_norm)
+    return TrainState(
+        agent=ppo.init_agent(
+            agent_key, environment.observation_size, environment.action_size, config.ppo
+        ),
+        disc=networks.init_network(disc, optimizer),
+        obs_normalizer=normalizer.init_normalizer(running.env.obs, AXIS),
+        feature_normalizer=normalizer.init_normalizer(s),
+        running=running,
+        alpha=alpha,
+        key=key,
+        update=jnp.zeros((), jnp.int32),
+        nan_count=jnp.zeros((), jnp.int32),
+        episode_length=jnp.zeros(()),
+        fall_rate=jnp.zeros(()),
+    )
+
+
+def of_device(key: Array) -> Array:
+    """The key of this device of the mesh axis."""
+    return jax.random.fold_in(key, jax.lax.axis_index(AXIS))

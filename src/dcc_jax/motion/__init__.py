@@ -1,0 +1,1 @@
+"""Motion: clips of the character, importers, retargeting, and our own clips."""

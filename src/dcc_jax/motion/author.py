@@ -1,0 +1,118 @@
+"""Our own clips, by name: what a fresh install trains on.
+
+`author(name)` plans the motion at 60 Hz and keeps every second frame: 30 fps, the
+control rate. The same code gives the same bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from dcc_jax.motion import author_door, author_gaits, author_jumps, author_stand
+from dcc_jax.motion.author_dynamics import Solved
+from dcc_jax.motion.author_jumps import Jump
+from dcc_jax.motion.author_style import FPS, RATE
+from dcc_jax.motion.clip import Clip
+
+SOURCE = "dcc_jax.motion.author"
+LICENCE = "Apache-2.0"
+DECIMALS = 6  # of qpos, so that the last bits of a linear solver do not show
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How one clip is made."""
+
+    make: Callable[[], Solved]
+    label: str
+    loop: bool = False
+    phase: bool = False  # whether the clip carries its share of the duration
+
+
+def _recoveries() -> dict[str, Recipe]:
+    return {
+        f"recover_{angle:03d}": Recipe(
+            lambda angle=angle: author_stand.recovery(np.radians(angle)), "recover"
+        )
+        for angle in range(0, 360, 45)
+    }
+
+
+RECIPES: dict[str, Recipe] = {
+    "stand": Recipe(author_stand.stand, "stand", loop=True),
+    **_recoveries(),
+    "balance": Recipe(author_stand.small_steps, "balance"),
+    "jump": Recipe(lambda: author_jumps.jumps([Jump(0.20)]), "jump"),
+    "jump_high": Recipe(lambda: author_jumps.jumps([Jump(0.32)]), "jump"),
+    "jump_series": Recipe(
+        lambda: author_jumps.jumps(
+            [
+                Jump(0.14),
+                Jump(0.18, x=0.12),
+                Jump(0.22, x=-0.12),
+                Jump(0.18, y=0.10),
+                Jump(0.14, y=-0.10),
+                Jump(0.20, yaw=0.5),
+            ]
+        ),
+        "jump",
+    ),
+    "backflip": Recipe(author_jumps.backflip, "backflip"),
+    "walk": Recipe(author_gaits.walk, "walk"),
+    "walk_left": Recipe(lambda: author_gaits.walk(turn=0.20), "walk"),
+    "walk_right": Recipe(lambda: author_gaits.walk(turn=-0.20), "walk"),
+    "walk_cycle": Recipe(author_gaits.walk_cycle, "walk", loop=True),
+    "run": Recipe(author_gaits.run, "run"),
+    "run_cycle": Recipe(author_gaits.run_cycle, "run", loop=True),
+    "hop": Recipe(author_gaits.hop, "hop"),
+    "door": Recipe(author_door.open_door, "door", phase=True),
+}
+"""Every clip of ours; the recovery directions are degrees, 0 ahead, 90 left."""
+
+
+def clip_names() -> tuple[str, ...]:
+    """Names `author` knows."""
+    return tuple(RECIPES)
+
+
+def author(name: str) -> Clip:
+    """Makes one clip.
+
+    Raises:
+        ValueError: a name that is not in `clip_names()`.
+    """
+    if name not in RECIPES:
+        raise ValueError(f"no clip {name!r}; there are {', '.join(RECIPES)}")
+    recipe = RECIPES[name]
+    return as_clip(recipe.make(), name, recipe)
+
+
+def as_clip(solved: Solved, name: str, recipe: Recipe) -> Clip:
+    """The planned motion at 30 fps."""
+    qpos = solved.pose.qpos()[:: RATE // FPS]
+    if recipe.loop:
+        qpos = _closed(qpos)
+    phase = np.linspace(0.0, 1.0, len(qpos), dtype=np.float32)
+    return Clip(
+        qpos=np.round(qpos, DECIMALS).astype(np.float32),
+        fps=float(FPS),
+        name=name,
+        source=SOURCE,
+        licence=LICENCE,
+        loop=recipe.loop,
+        label=recipe.label,
+        phase=phase if recipe.phase else None,
+    )
+
+
+def _closed(qpos: np.ndarray) -> np.ndarray:
+    """The same with the last frame of a loop equal to the first one, joints and height.
+
+    Periodic plans agree there to the accuracy of the solution already.
+    """
+    qpos = qpos.copy()
+    qpos[-1, 2], qpos[-1, 7:] = qpos[0, 2], qpos[0, 7:]
+    return qpos

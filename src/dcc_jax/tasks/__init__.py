@@ -1,0 +1,51 @@
+"""The skills of the paper by name, and the environments they make."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dcc_jax.character import asset_path, load_character
+from dcc_jax.env.environment import EnvConfig, Environment
+from dcc_jax.env.task import Task
+from dcc_jax.motion.clip import Clip, load_clip
+from dcc_jax.motion.reference import make_references
+from dcc_jax.tasks.push import Push
+from dcc_jax.tasks.trampoline import Trampoline
+
+if TYPE_CHECKING:
+    from dcc_jax.config import Config
+
+TASKS: dict[str, type[Task]] = {task.name: task for task in (Push, Trampoline)}
+
+
+def make_task(name: str) -> Task:
+    """The task called `name`, with its defaults.
+
+    Raises:
+        ValueError: there is none; the message lists them.
+    """
+    if name not in TASKS:
+        raise ValueError(f"task must be one of {', '.join(TASKS)}, got {name!r}")
+    return TASKS[name]()
+
+
+def make_environment(config: Config) -> Environment:
+    """The environment that a configuration describes.
+
+    Raises:
+        ValueError: an unknown task.
+        MotionError: a clip that cannot be read.
+    """
+    task = make_task(config.task)
+    return Environment(
+        task,
+        load_character(config.env.mass),
+        make_references(_clips(task, config.env)),
+        config.env,
+    )
+
+
+def _clips(task: Task, config: EnvConfig) -> list[Clip]:
+    if config.clips:
+        return [load_clip(path) for path in config.clips]
+    return [load_clip(asset_path(f"motions/{name}.npz")) for name in task.clips]

@@ -1,0 +1,161 @@
+"""Pushed balance (Sec. 5.2): 1 kg balls thrown at a standing character from all sides.
+
+The force fed to the compliance is the strongest contact of a ball with the character.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from dcc_jax import physics
+from dcc_jax.character import add_contact
+from dcc_jax.env.task import Forces, Task, place_character
+from dcc_jax.motion.reference import RefState
+
+Array = jax.Array
+
+TARGETS = ("chest", "abdomen", "pelvis", "head", "left_upper_arm", "right_upper_arm")
+"""Geoms a ball can hit."""
+AIM_HEIGHTS = (0.75, 1.35)  # m above the ground, of the standing character
+GRAVITY = 9.81
+
+
+@flax.struct.dataclass
+class State:
+    """When the next ball comes."""
+
+    next_throw: Array  # [] s until then
+
+
+@dataclass(frozen=True)
+class Push(Task):
+    """Stand, and step where it takes a step."""
+
+    name: ClassVar[str] = "push"
+    clips: ClassVar[tuple[str, ...]] = (
+        "stand",
+        "balance",
+        *(f"recover_{angle:03d}" for angle in range(0, 360, 45)),
+    )
+    state_size: ClassVar[int] = 6
+
+    interval: float = 1.5
+    """s between two throws."""
+    mass: float = 1.0
+    """kg, Sec. 5.2."""
+    radius: float = 0.1
+    """m."""
+    speed: tuple[float, float] = (2.0, 3.0)
+    """m/s at the release, Sec. 5.2."""
+    distance: float = 0.8
+    """m from the root at the release."""
+
+    def extend(self, spec: mujoco.MjSpec) -> None:
+        """A free ball that touches the character's trunk, head and upper arms."""
+        ball = spec.worldbody.add_body(name="ball", pos=[0.0, 0.0, -10.0])
+        ball.add_freejoint(name="ball")
+        ball.add_geom(
+            name="ball",
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            size=[self.radius, 0, 0],
+            mass=self.mass,
+            rgba=[0.9, 0.45, 0.1, 1.0],
+            contype=0,
+            conaffinity=0,
+        )
+        for target in TARGETS:
+            add_contact(spec, "ball", target, friction=0.5)
+
+    def reset(
+        self, key: Array, scene: physics.Scene, reference: RefState
+    ) -> tuple[State, Array, Array]:
+        """The first ball comes after a random share of the interval."""
+        qpos, qvel = place_character(scene, reference)
+        return State(self.interval * jax.random.uniform(key)), qpos, qvel
+
+    def control_step(
+        self, key: Array, scene: physics.Scene, state: State, body: physics.State
+    ) -> tuple[State, physics.State]:
+        """Releases the next ball when its time has come."""
+        due = state.next_throw <= 0.0
+        thrown = self._thrown(key, scene, body)
+        body = jax.tree.map(lambda a, b: jnp.where(due, a, b), thrown, body)
+        waited = jnp.where(due, self.interval, state.next_throw)
+        return State(waited - 1.0 / 30.0), body
+
+    def _thrown(
+        self, key: Array, scene: physics.Scene, body: physics.State
+    ) -> physics.State:
+        side_key, height_key, speed_key = jax.random.split(key, 3)
+        side = jax.random.uniform(side_key, minval=-jnp.pi, maxval=jnp.pi)
+        low, high = AIM_HEIGHTS
+        height = jax.random.uniform(height_key, minval=low, maxval=high)
+        speed = jax.random.uniform(
+            speed_key, minval=self.speed[0], maxval=self.speed[1]
+        )
+        away = jnp.stack([jnp.cos(side), jnp.sin(side), jnp.zeros(())])
+        root, drift = scene.character_qpos(body.qpos)[:2], _drift(scene, body)
+        flight = (self.distance - self.radius - 0.1) / speed
+        start = jnp.append(root, height) + self.distance * away
+        # It rises by as much as gravity takes until it arrives.
+        velocity = -speed * away + jnp.append(drift, 0.5 * GRAVITY * flight)
+        q_adr, v_adr = _ball(scene)
+        pose = jnp.concatenate([start, jnp.array([1.0, 0.0, 0.0, 0.0])])
+        motion = jnp.concatenate([velocity, jnp.zeros(3)])
+        return body.replace(
+            qpos=body.qpos.at[q_adr : q_adr + 7].set(pose),
+            qvel=body.qvel.at[v_adr : v_adr + 6].set(motion),
+            qacc=body.qacc.at[v_adr : v_adr + 6].set(0.0),
+        )
+
+    def forces(
+        self,
+        scene: physics.Scene,
+        state: State,
+        kin: physics.Kinematics,
+        solution: physics.Solution,
+        action: Array,
+    ) -> tuple[State, Forces]:
+        """The strongest contact of the ball, F = 1."""
+        slots, bodies, sign = _ball_contacts(scene)
+        force = sign[:, None] * solution.contact_force_w[slots]
+        strongest = jnp.argmax(jnp.sum(force * force, axis=-1))
+        return state, Forces(
+            force_w=force[strongest][None],
+            point_w=solution.contact_point_w[slots][strongest][None],
+            body=jnp.asarray(bodies)[strongest][None],
+            gate=jnp.ones((), bool),
+        )
+
+    def observe(self, scene: physics.Scene, state: State, body: physics.State) -> Array:
+        """Nothing of the ball: a push is felt, not seen. Root velocity, [6]."""
+        return scene.character_qvel(body.qvel)[:6]
+
+
+def _drift(scene: physics.Scene, body: physics.State) -> Array:
+    return scene.character_qvel(body.qvel)[:2]
+
+
+def _ball(scene: physics.Scene) -> tuple[int, int]:
+    joint = scene.model.joint("ball")
+    return int(joint.qposadr[0]), int(joint.dofadr[0])
+
+
+def _ball_contacts(scene: physics.Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Contact slots of the ball, the character's bodies there, and the force's sign."""
+    ball = scene.body("ball")
+    bodies = scene.contact_bodies
+    slots = np.flatnonzero((bodies == ball).any(axis=1))
+    second = bodies[slots, 1] != ball
+    return (
+        slots,
+        np.where(second, bodies[slots, 1], bodies[slots, 0]),
+        np.where(second, 1.0, -1.0),
+    )

@@ -1,0 +1,180 @@
+"""The trampoline (Sec. 5.3): a rigid plate on springs that bounces the character.
+
+The fabric is a rigid plate with a spring-damper at each of its four corners, that is,
+one in height, roll and pitch. Every three seconds an upward force on the plate throws
+the character up. The contact forces of the feet are fed to the compliance for one
+second after each landing: absorb, then recover.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from dcc_jax import physics
+from dcc_jax.character import FEET, add_contact, sole_names
+from dcc_jax.env.task import Forces, Task, place_character, resultant
+from dcc_jax.motion.reference import RefState
+
+Array = jax.Array
+
+GRAVITY = 9.81
+HALF_SIZE, HALF_THICKNESS = 1.5, 0.05  # m
+
+
+@flax.struct.dataclass
+class State:
+    """The bounce schedule and the landing that opens the gate."""
+
+    next_bounce: Array  # [] s until the plate kicks; negative while it does
+    airborne: Array  # [] s since a foot last touched the plate
+    landed: Array  # [] s since the last landing
+
+
+@dataclass(frozen=True)
+class Trampoline(Task):
+    """Stand on the plate, fly, land, absorb."""
+
+    name: ClassVar[str] = "trampoline"
+    clips: ClassVar[tuple[str, ...]] = ("stand", "balance", "jump", "jump_series")
+    state_size: ClassVar[int] = 8
+
+    interval: float = 3.0
+    """s between two bounces, Sec. 5.3."""
+    plate_mass: float = 20.0
+    """kg."""
+    stiffness: float = 8000.0
+    """N/m of the four corners together: the standing character sinks it by 8 cm."""
+    damping: float = 500.0
+    """N s/m, together; a damping ratio of 0.3 with the character on it."""
+    kick: float = 2400.0
+    """N, upward on the plate, for `kick_time`."""
+    kick_time: float = 0.2
+    """s."""
+    absorb_time: float = 1.0
+    """s after a landing in which the controller listens, Sec. 5.3."""
+    flight_time: float = 0.08
+    """s without contact that make the next touch a landing."""
+
+    @property
+    def has_floor(self) -> bool:
+        """The plate is the ground."""
+        return False
+
+    def extend(self, spec: mujoco.MjSpec) -> None:
+        """The plate, its springs, and contacts with the soles."""
+        plate = spec.worldbody.add_body(name="plate", pos=[0, 0, -HALF_THICKNESS])
+        corner = HALF_SIZE**2
+        for name, kind, axis, scale in (
+            ("plate_z", mujoco.mjtJoint.mjJNT_SLIDE, [0, 0, 1], 1.0),
+            ("plate_roll", mujoco.mjtJoint.mjJNT_HINGE, [1, 0, 0], corner),
+            ("plate_pitch", mujoco.mjtJoint.mjJNT_HINGE, [0, 1, 0], corner),
+        ):
+            joint = plate.add_joint(name=name, type=kind, axis=axis)
+            joint.stiffness = np.array([scale * self.stiffness, 0, 0])
+            joint.damping = np.array([scale * self.damping, 0, 0])
+        plate.add_geom(
+            name="plate",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=[HALF_SIZE, HALF_SIZE, HALF_THICKNESS],
+            mass=self.plate_mass,
+            rgba=[0.3, 0.45, 0.75, 1.0],
+            contype=0,
+            conaffinity=0,
+        )
+        for sole in sole_names(spec):
+            add_contact(spec, "plate", sole)
+
+    def reset(
+        self, key: Array, scene: physics.Scene, reference: RefState
+    ) -> tuple[State, Array, Array]:
+        """The plate at rest; the first bounce after a random share of the interval."""
+        qpos, qvel = place_character(scene, reference)
+        state = State(
+            next_bounce=self.interval * jax.random.uniform(key),
+            airborne=jnp.zeros(()),
+            landed=jnp.full((), self.absorb_time),
+        )
+        return state, qpos, qvel
+
+    def control_step(
+        self, key: Array, scene: physics.Scene, state: State, body: physics.State
+    ) -> tuple[State, physics.State]:
+        """Counts down to the bounce."""
+        over = state.next_bounce < -self.kick_time
+        left = jnp.where(over, state.next_bounce + self.interval, state.next_bounce)
+        return state.replace(next_bounce=left - 1.0 / 30.0), body
+
+    def applied(self, scene: physics.Scene, state: State, time: Array) -> Array:
+        """The weights that the springs' rest position carries, and the kick."""
+        weight = GRAVITY * float(scene.model.body_mass.sum())
+        kicking = state.next_bounce <= 0.0
+        height = int(scene.model.joint("plate_z").dofadr[0])
+        force = weight + jnp.where(kicking, self.kick, 0.0)
+        return jnp.zeros(scene.model.nv).at[height].set(force)
+
+    def forces(
+        self,
+        scene: physics.Scene,
+        state: State,
+        kin: physics.Kinematics,
+        solution: physics.Solution,
+        action: Array,
+    ) -> tuple[State, Forces]:
+        """One resultant a foot, F = 2; heard for a while after each landing."""
+        feet = [scene.body(name) for name in FEET]
+        sums = [_foot_force(scene, solution, foot) for foot in feet]
+        force = jnp.stack([f for f, _ in sums])
+        touching = jnp.any(force != 0.0)
+        landing = touching & (state.airborne > self.flight_time)
+        state = state.replace(
+            airborne=jnp.where(touching, 0.0, state.airborne + scene.timestep),
+            landed=jnp.where(landing, 0.0, state.landed + scene.timestep),
+        )
+        return state, Forces(
+            force_w=force,
+            point_w=jnp.stack([p for _, p in sums]),
+            body=jnp.asarray(feet),
+            gate=state.landed < self.absorb_time,
+        )
+
+    def observe(self, scene: physics.Scene, state: State, body: physics.State) -> Array:
+        """Plate height, tilt and their rates [6]; time to and since events [2]."""
+        adr = int(scene.model.joint("plate_z").qposadr[0])
+        dof = int(scene.model.joint("plate_z").dofadr[0])
+        return jnp.concatenate(
+            [
+                body.qpos[adr : adr + 3],
+                body.qvel[dof : dof + 3],
+                jnp.stack([state.next_bounce, jnp.minimum(state.landed, 1.0)]),
+            ]
+        )
+
+    def terminated(
+        self, scene: physics.Scene, state: State, body: physics.State
+    ) -> Array:
+        """Off the plate."""
+        root = scene.character_qpos(body.qpos)[:2]
+        return jnp.any(jnp.abs(root) > HALF_SIZE - 0.1)
+
+    def ground_height(
+        self, scene: physics.Scene, state: State, body: physics.State
+    ) -> Array:
+        """Height of the plate's middle."""
+        return body.qpos[int(scene.model.joint("plate_z").qposadr[0])]
+
+
+def _foot_force(
+    scene: physics.Scene, solution: physics.Solution, foot: int
+) -> tuple[Array, Array]:
+    bodies = scene.contact_bodies
+    slots = np.flatnonzero((bodies == foot).any(axis=1))
+    sign = np.where(bodies[slots, 1] == foot, 1.0, -1.0)
+    force = sign[:, None] * solution.contact_force_w[slots]
+    return resultant(force, solution.contact_point_w[slots])

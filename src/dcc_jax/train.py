@@ -1,0 +1,83 @@
+"""`python -m dcc_jax.train`: trains a policy; `--help` lists every option.
+
+The loop itself is in `dcc_jax.training`. This file imports nothing heavy before
+`runtime.setup()` has told JAX how many devices there are.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dcc_jax import runtime
+
+if TYPE_CHECKING:
+    from dcc_jax.config import Config
+    from dcc_jax.learn.rollout import Environment
+    from dcc_jax.training import TrainResult
+
+
+def train(
+    config: Config,
+    *,
+    run_dir: Path | str | None = None,
+    resume: bool = False,
+    environment: Environment | None = None,
+    quiet: bool = False,
+) -> TrainResult:
+    """Trains a policy; `dcc_jax.training.train` says what the arguments are."""
+    from dcc_jax import training
+
+    return training.train(
+        config, run_dir=run_dir, resume=resume, environment=environment, quiet=quiet
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit status."""
+    try:
+        if "jax" not in sys.modules:
+            runtime.setup()
+        from dcc_jax import options, training
+
+        said = options.parse(sys.argv[1:] if argv is None else argv)
+        run = training.prepare(said.config, said.run_dir, said.resume)
+    # OSError: a run directory that cannot be made, a clip that cannot be opened.
+    except (ValueError, OSError) as error:
+        return _complain(str(error), 2)
+    try:
+        training.execute(run)
+    except training.RunError as error:
+        return _complain(str(error), 1)
+    except KeyboardInterrupt:
+        return _complain("interrupted twice; what was not saved is lost", 1)
+    except Exception as error:
+        log = run.run_dir / "error.log"
+        with contextlib.suppress(OSError):
+            log.write_text(traceback.format_exc())
+        reason = (str(error).splitlines() or [""])[0][:200]
+        return _complain(f"{type(error).__name__}: {reason} (details in {log})", 1)
+    return 0
+
+
+def _complain(problem: str, status: int) -> int:
+    with contextlib.suppress(OSError):
+        print(f"dcc_jax.train: {' '.join(problem.split())}", file=sys.stderr)
+    return status
+
+
+def _leave(status: int) -> None:
+    """Ends the process at once: XLA's threads can hold up an ordinary exit."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError):
+            stream.flush()
+    os._exit(status)
+
+
+if __name__ == "__main__":
+    _leave(main())

@@ -1,0 +1,422 @@
+"""compliance.py: Alg. 1 by hand, its bounds, its return; Eq. (4) and (7) simulated."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import chex
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from mujoco import mjx
+
+from dcc_jax import quat
+from dcc_jax.character import load_character
+from dcc_jax.control import compliance
+from dcc_jax.control.stiffness import determinant, modulated_stiffness, stiffness
+
+CHARACTER = load_character()
+MODEL = CHARACTER.spec().compile()
+COORDS = quat.Coordinates.of(MODEL)
+CONFIG = compliance.ComplianceConfig()
+MEASURED = compliance.ComplianceConfig(velocity="measured")
+REST = compliance.at_rest(COORDS)
+RETURN = compliance.return_stiffness(CONFIG, MODEL.nv)
+H = CONFIG.response_time
+BATCH = 96
+STEPS = 480
+DT = 1.0 / 240.0
+
+
+@jax.jit
+@jax.vmap
+@chex.assert_max_traces(1)
+def velocity(J, delta_qdd, alpha, weights):
+    """ud [BATCH, 42] of one force in each of BATCH environments."""
+    return compliance.displacement_velocity(
+        J[None], delta_qdd[None], alpha, weights, CONFIG
+    )
+
+
+@jax.jit
+@jax.vmap
+@chex.assert_max_traces(1)
+def measured_velocity(J, xd, alpha, weights):
+    """The same from measured velocities [BATCH, 3] of the points."""
+    return compliance.displacement_velocity(J[None], xd[None], alpha, weights, MEASURED)
+
+
+@jax.jit
+@chex.assert_max_traces(1)
+def course(displacement, ud_forces, active_steps, dt):
+    """STEPS steps under the same ud, of which the first few are active.
+
+    Returns the last displacement and log u after every step, [STEPS, 42].
+    """
+
+    def step(displacement, index):
+        displacement = compliance.advance(
+            COORDS, displacement, ud_forces, index < active_steps, dt, RETURN
+        )
+        return displacement, quat.log_map(COORDS, displacement.u)
+
+    return jax.lax.scan(step, displacement, jnp.arange(STEPS))
+
+
+def pushed(q: np.ndarray, body: int, force: np.ndarray) -> tuple[np.ndarray, ...]:
+    """J [3, 42] and M^-1 J^T f [42] at the origin of a body, by C MuJoCo."""
+    data = mujoco.MjData(MODEL)
+    data.qpos[:] = q
+    mujoco.mj_forward(MODEL, data)
+    J, delta_qdd = np.zeros((3, MODEL.nv)), np.zeros((1, MODEL.nv))
+    mujoco.mj_jac(MODEL, data, J, None, data.xpos[body], body)
+    mujoco.mj_solveM(MODEL, data, delta_qdd, (J.T @ force)[None])
+    return J, delta_qdd[0]
+
+
+def random_pushes(seed: int, newtons: float) -> tuple[np.ndarray, np.ndarray]:
+    """J [BATCH, 3, 42] and delta_qdd [BATCH, 42] of random poses, bodies, forces."""
+    rng = np.random.default_rng(seed)
+    rows = []
+    for _ in range(BATCH):
+        q = MODEL.qpos0.copy()
+        mujoco.mj_integratePos(MODEL, q, rng.normal(0.0, 0.5, MODEL.nv), 1.0)
+        force = rng.normal(size=3)
+        force *= newtons / np.linalg.norm(force)
+        rows.append(pushed(q, int(rng.integers(1, MODEL.nbody)), force))
+    J, delta_qdd = zip(*rows, strict=True)
+    return np.array(J, np.float32), np.array(delta_qdd, np.float32)
+
+
+def velocities(J, motion, alpha=0.16, weights=CHARACTER.column_weight, of=velocity):
+    """`velocity` in numpy, alpha and weights spread over the batch."""
+    alphas = jnp.full(BATCH, alpha, jnp.float32)
+    spread = jnp.asarray(np.broadcast_to(weights, (BATCH, MODEL.nv)), jnp.float32)
+    return np.asarray(of(jnp.asarray(J), jnp.asarray(motion), alphas, spread))
+
+
+def alone(rows: list[list[float]]) -> np.ndarray:
+    """A small matrix [r, n] padded with zeros to a batch, [BATCH, r, 42]."""
+    padded = np.zeros((BATCH, len(rows), MODEL.nv), np.float32)
+    padded[:, :, : len(rows[0])] = rows
+    return padded
+
+
+def test_velocity_of_a_pendulum_by_hand():
+    # A point mass of 2 kg at the end of a 0.5 m rod, pushed across it with 10 N.
+    length, mass, force, alpha = 0.5, 2.0, 10.0, 0.16
+    J = alone([[0.0], [length], [0.0]])
+    delta_qdd = alone([[force / (mass * length)]])[:, 0]
+    ud = velocities(J, delta_qdd, alpha, np.ones(MODEL.nv))
+    exact = alpha / 600.0 * force / (mass * length)
+    damped = length**2 / (length**2 + 1e-4)
+    np.testing.assert_allclose(ud[0, 0], exact * damped, rtol=1e-6)
+    np.testing.assert_array_equal(ud[0, 1:], 0.0)
+
+
+def test_point_yields_by_alpha_whatever_the_weights():
+    J, _ = random_pushes(0, 100.0)
+    rng = np.random.default_rng(0)
+    weights = rng.uniform(0.2, 3.0, (BATCH, MODEL.nv)).astype(np.float32)
+    xd = rng.normal(size=(BATCH, 3)).astype(np.float32)
+    ud = velocities(J, xd, 0.3, weights, of=measured_velocity)
+    point = np.einsum("bij,bj->bi", J, ud)
+    np.testing.assert_allclose(point, 0.3 * xd, atol=1e-3)
+
+
+def test_joint_of_twice_the_weight_turns_twice_as_far():
+    J = alone([[0.3, 0.3], [0.0, 0.0], [0.0, 0.0]])
+    xd = np.tile(np.array([1.0, 0.0, 0.0], np.float32), (BATCH, 1))
+    weights = np.r_[2.0, np.ones(MODEL.nv - 1)]
+    (twice, once), *_ = velocities(J, xd, 1.0, weights, of=measured_velocity)[:, :2]
+    assert twice == pytest.approx(2.0 * once)
+    assert 0.3 * (twice + once) == pytest.approx(1.0, rel=1e-3)
+
+
+def test_columns_of_weight_zero_are_never_displaced():
+    ud = velocities(*random_pushes(1, 180.0))
+    np.testing.assert_array_equal(ud[:, 2:6], 0.0)
+    assert np.all(np.abs(ud[:, :2]).max(axis=0) > 0.0)
+
+
+def test_forces_add_up_and_vmap_is_a_loop():
+    J, delta_qdd = random_pushes(2, 100.0)
+    weights = jnp.asarray(CHARACTER.column_weight, jnp.float32)
+    each = velocities(J, delta_qdd)
+    together = jax.jit(compliance.displacement_velocity, static_argnames="config")
+    for first in range(0, 10, 2):
+        pair = slice(first, first + 2)
+        np.testing.assert_allclose(
+            together(J[pair], delta_qdd[pair], 0.16, weights, CONFIG),
+            each[pair].sum(axis=0),
+            rtol=1e-4,
+            atol=1e-7,
+        )
+
+
+def test_velocity_by_measurement_and_by_dynamics_agree_on_the_same_motion():
+    J, delta_qdd = random_pushes(3, 100.0)
+    moved = np.where(CHARACTER.column_weight > 0.0, H * delta_qdd, 0.0)
+    xd = np.einsum("bij,bj->bi", J, moved).astype(np.float32)
+    np.testing.assert_allclose(
+        velocities(J, xd, of=measured_velocity),
+        velocities(J, delta_qdd),
+        rtol=1e-3,
+        atol=1e-6,
+    )
+
+
+@pytest.mark.parametrize("newtons", [0.0, 1e-9, 1.0, 180.0, 1e6])
+@pytest.mark.parametrize("uneven", [False, True])
+def test_velocity_never_exceeds_alpha_h_delta_qdd(newtons, uneven):
+    J, delta_qdd = random_pushes(4, newtons)
+    weights = CHARACTER.column_weight
+    if uneven:
+        weights = 10.0 ** np.random.default_rng(4).uniform(-2, 2, (BATCH, MODEL.nv))
+    ud = velocities(J, delta_qdd, 0.16, weights).astype(float)
+    bound = 0.16 * H * np.linalg.norm(delta_qdd.astype(float), axis=1)
+    assert np.all(np.linalg.norm(ud, axis=1) <= bound * (1.0 + 1e-5))
+    assert np.all(np.any(ud != 0.0, axis=1)) == (newtons > 0.0)
+
+
+@pytest.mark.parametrize("newtons", [0.0, 1e-9, 180.0, 1e6])
+def test_displacement_at_singular_poses_stays_finite_and_bounded(newtons):
+    hand = 1 + CHARACTER.body_names.index("left_hand")
+    chest = 1 + CHARACTER.body_names.index("chest")
+    cases = [
+        pushed(MODEL.qpos0, hand, np.array([0.0, newtons, 0.0])),  # along the arm
+        pushed(MODEL.qpos0, chest, np.array([0.0, 0.0, newtons])),  # along the spine
+        pushed(MODEL.qpos0, 1, np.array([0.0, 0.0, newtons])),  # the root, upwards
+    ]
+    J, delta_qdd = (np.array(x, np.float32) for x in zip(*cases, strict=True))
+    padding = (-len(cases)) % BATCH
+    ud = velocities(
+        np.pad(J, ((0, padding), (0, 0), (0, 0))),
+        np.pad(delta_qdd, ((0, padding), (0, 0))),
+    )
+    for case in range(len(cases)):
+        bound = 0.16 * H * np.linalg.norm(delta_qdd[case].astype(float))
+        assert np.linalg.norm(ud[case].astype(float)) <= bound * (1.0 + 1e-5)
+        displacement, _ = course(REST, ud[case], STEPS, DT)
+        chex.assert_tree_all_finite(displacement)
+        farthest = bound * STEPS * DT
+        assert np.abs(displacement.u[:3]).max() <= farthest * (1.0 + 1e-4)
+        norms = np.linalg.norm(np.asarray(displacement.u)[COORDS.quat_qpos], axis=1)
+        np.testing.assert_allclose(norms, 1.0, atol=1e-5)
+
+
+def test_level_zero_is_exactly_inert():
+    for ud in velocities(*random_pushes(5, 1e6), alpha=0.0)[:5]:
+        displacement, _ = course(REST, ud, STEPS // 2, DT)
+        chex.assert_trees_all_equal(displacement, REST)
+
+
+def test_no_force_decays_to_the_reference_and_takes_the_velocity_along():
+    _, path = course(REST, jnp.ones(MODEL.nv), 1, DT)
+    np.testing.assert_allclose(path[0], DT, rtol=1e-4)
+    path = np.asarray(path)
+    # Critically damped from x = 0 with v = 1: x = t exp(-w t), largest 1 / (e w).
+    for dof, stiffness_ in ((0, 60.0), (10, 100.0)):
+        peak = 1.0 / (math.e * math.sqrt(stiffness_))
+        assert path[:, dof].max() == pytest.approx(peak, rel=0.1)
+    assert np.abs(path[-1]).max() < 1e-4
+    assert path.min() > -1e-5
+
+
+@pytest.mark.parametrize("dt", [1e-4, 1.0 / 30.0, 1.0, 1e3])
+def test_return_is_stable_at_any_step(dt):
+    tangent = jnp.asarray(np.random.default_rng(6).normal(0.0, 1.0, MODEL.nv))
+    displacement = compliance.Displacement(
+        u=quat.exp_map(COORDS, tangent).astype(jnp.float32),
+        ud=jnp.asarray(10.0 * tangent, jnp.float32),
+    )
+    _, path = course(displacement, jnp.zeros(MODEL.nv), 0, dt)
+    assert np.abs(path).max() < 2.0 * np.abs(tangent).max()
+    if dt >= 1.0 / 30.0:
+        assert np.abs(path[-1]).max() < 1e-3
+
+
+def test_only_forces_of_exactly_zero_do_not_act():
+    assert not compliance.acting(jnp.zeros((4, 3)))
+    assert compliance.acting(jnp.zeros((4, 3)).at[2, 1].set(-1e-9))
+
+
+def test_step_is_the_same_without_jit():
+    J, delta_qdd = random_pushes(7, 100.0)
+    weights = jnp.asarray(CHARACTER.column_weight, jnp.float32)
+    plain_ud = compliance.displacement_velocity(
+        J[0][None], delta_qdd[0][None], 0.16, weights, CONFIG
+    )
+    together = velocities(J, delta_qdd)
+    np.testing.assert_allclose(together[0], plain_ud, rtol=1e-4, atol=1e-7)
+    plain = compliance.advance(COORDS, REST, plain_ud, True, DT, RETURN)
+    _, path = course(REST, together[0], 1, DT)
+    np.testing.assert_allclose(
+        quat.log_map(COORDS, plain.u), path[0], rtol=1e-4, atol=1e-7
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("velocity", "guessed"),
+        ("response_time", 0.0),
+        ("damping", -1e-4),
+        ("joint_return_stiffness", math.inf),
+        ("root_return_stiffness", math.nan),
+    ],
+)
+def test_a_bad_constant_is_refused_by_name(name, value):
+    with pytest.raises(ValueError, match=f"{name} must be"):
+        compliance.ComplianceConfig(**{name: value})
+
+
+# A fixed-base arm of three hinges (J is square) and one of seven velocities.
+HINGES = """
+<mujoco><option timestep="0.003" gravity="0 0 0"/>
+<default><joint damping="8" armature="0.01"/></default>
+<worldbody><body name="base"><joint axis="0 0 1"/><geom size=".05" mass="1"/>
+  <body name="upper"><joint axis="0 1 0"/><geom size=".04" pos=".2 0 0" mass="1.5"/>
+    <body name="lower" pos=".4 0 0"><joint axis="0 1 0"/>
+      <geom size=".04" pos=".2 0 0" mass="1"/>
+</body></body></body></worldbody></mujoco>"""
+BALLS = """
+<mujoco><option timestep="0.003" gravity="0 0 0"/>
+<default><joint damping="8" armature="0.01"/></default>
+<worldbody><body name="upper"><joint type="ball"/>
+  <geom size=".04" pos=".15 0 0" mass="1.5"/>
+  <body name="middle" pos=".3 0 0"><joint axis="0 1 0"/>
+    <geom size=".04" pos=".15 0 0" mass="1"/>
+    <body name="lower" pos=".3 0 0"><joint type="ball"/>
+      <geom size=".04" pos=".1 0 0" mass="0.5"/>
+</body></body></body></worldbody></mujoco>"""
+LEVELS = (0.0, 0.04, 0.08, 0.16, 0.5)
+KP = 100.0
+
+
+@dataclass(frozen=True)
+class Arm:
+    model: mujoco.MjModel
+    rest: np.ndarray  # tangent from qpos0 of the pose it is held in
+    tip: tuple[float, float, float]  # on the body "lower", m
+    weights: np.ndarray  # [nv]
+
+    @property
+    def q_m(self) -> np.ndarray:
+        q = self.model.qpos0.copy()
+        mujoco.mj_integratePos(self.model, q, self.rest, 1.0)
+        return q
+
+
+ARMS = {
+    "three hinges": Arm(
+        mujoco.MjModel.from_xml_string(HINGES),
+        np.array([0.4, -0.5, 1.2]),
+        (0.4, 0.0, 0.0),
+        np.ones(3),
+    ),
+    "balls of unequal weights": Arm(
+        mujoco.MjModel.from_xml_string(BALLS),
+        np.array([0.3, -0.4, 0.5, 1.2, 0.3, 0.4, -0.6]),
+        (0.2, 0.0, 0.0),
+        np.array([2.0, 2.0, 2.0, 1.0, 1.0, 1.0, 1.0]),
+    ),
+}
+
+
+def controllers(arm: Arm):
+    """One step of the controllers of B arms: displacements, J, qvel, alpha -> q_bar."""
+    coords = quat.Coordinates.of(arm.model)
+    k = compliance.return_stiffness(MEASURED, arm.model.nv, root_dofs=0)
+    q_m, dt = jnp.asarray(arm.q_m, jnp.float32), arm.model.opt.timestep
+
+    def step(displacement, J, qvel, alpha):
+        xd = compliance.point_velocity(J[None], qvel, arm.weights)
+        ud = compliance.displacement_velocity(J[None], xd, alpha, arm.weights, MEASURED)
+        displacement = compliance.advance(coords, displacement, ud, True, dt, k)
+        return displacement, quat.oplus(coords, q_m, displacement.u)
+
+    start = compliance.at_rest(coords)
+    return start, jax.jit(jax.vmap(step))
+
+
+def simulated_rest(arm: Arm, forces: np.ndarray, levels: np.ndarray) -> np.ndarray:
+    """Where constant forces [B, 3] take the tip in 3 s of C MuJoCo, m [B, 3]."""
+    model, body = arm.model, arm.model.body("lower").id
+    start, step = controllers(arm)
+    displacement = jax.tree.map(lambda x: jnp.tile(x, (len(forces), 1)), start)
+    q_bar = np.tile(arm.q_m, (len(forces), 1))
+    runs = [mujoco.MjData(model) for _ in forces]
+    J = np.zeros((len(forces), 3, model.nv))
+    tips, error = np.zeros((len(forces), 3)), np.zeros(model.nv)
+    for data in runs:
+        data.qpos[:] = arm.q_m
+        mujoco.mj_forward(model, data)
+    began = _tip(runs[0], body, arm.tip)
+    for _ in range(1000):
+        for i, data in enumerate(runs):
+            tips[i] = _tip(data, body, arm.tip)
+            mujoco.mj_jac(model, data, J[i], None, tips[i], body)
+            mujoco.mj_differentiatePos(model, error, 1.0, data.qpos, q_bar[i])
+            data.qfrc_applied[:] = KP * error + J[i].T @ forces[i]
+            mujoco.mj_step(model, data)
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+        qvel = np.stack([data.qvel for data in runs]).astype(np.float32)
+        displacement, target = step(displacement, J.astype(np.float32), qvel, levels)
+        q_bar = np.asarray(target, float)
+    assert np.abs(qvel).max() < 1e-3
+    return tips - began
+
+
+def _tip(data: mujoco.MjData, body: int, point: tuple[float, float, float]):
+    return data.xpos[body] + data.xmat[body].reshape(3, 3) @ np.array(point)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_simulated_static_stiffness_is_kp_one_minus_alpha_L(name):
+    arm = ARMS[name]
+    K = stiffness(arm.model, arm.q_m, "lower", arm.tip, KP)
+    size = 0.01 * np.sqrt(np.linalg.eigvalsh(K)[0] * np.linalg.eigvalsh(K)[1])
+    signed = size * np.concatenate([np.eye(3), -np.eye(3)])
+    forces = np.tile(signed, (len(LEVELS), 1))
+    levels = np.repeat(np.array(LEVELS, np.float32), 6)
+    tips = simulated_rest(arm, forces, levels).reshape(len(LEVELS), 2, 3, 3)
+    for alpha, (plus, minus) in zip(LEVELS, tips, strict=True):
+        K_hat = np.linalg.inv((plus - minus).T / (2.0 * size))
+        expected = modulated_stiffness(K, alpha)
+        error = np.linalg.norm(K_hat - expected) / np.linalg.norm(expected)
+        assert error < (0.01 if alpha == 0.0 else 0.02)
+        ratio = determinant(0.5 * (K_hat + K_hat.T)) / determinant(K)
+        assert ratio == pytest.approx((1.0 - alpha) ** 3, rel=0.04)
+
+
+def test_delta_qdd_is_the_difference_of_two_forward_passes_of_mjx():
+    # An arm, because the character's forward pass compiles for half a minute.
+    arm, rng = ARMS["balls of unequal weights"], np.random.default_rng(8)
+    c_data = mujoco.MjData(arm.model)
+    c_data.qpos[:] = arm.q_m
+    mujoco.mj_forward(arm.model, c_data)
+    body = arm.model.body("lower").id
+    J, delta_qdd = np.zeros((3, arm.model.nv)), np.zeros((1, arm.model.nv))
+    mujoco.mj_jac(arm.model, c_data, J, None, _tip(c_data, body, arm.tip), body)
+    torque = J.T @ np.array([30.0, -120.0, 60.0])
+    mujoco.mj_solveM(arm.model, c_data, delta_qdd, torque[None])
+    model = mjx.put_model(arm.model)
+    data = mjx.make_data(model).replace(
+        qpos=jnp.asarray(arm.q_m, jnp.float32),
+        qvel=jnp.asarray(rng.normal(0.0, 1.0, arm.model.nv), jnp.float32),
+    )
+
+    @jax.jit
+    @jax.vmap
+    def accelerations(applied):
+        return mjx.forward(model, data.replace(qfrc_applied=applied)).qacc
+
+    applied = jnp.asarray(np.stack([torque, np.zeros_like(torque)]), jnp.float32)
+    with_force, without = np.asarray(accelerations(applied), float)
+    scale = np.abs(with_force).max()
+    np.testing.assert_allclose(with_force - without, delta_qdd[0], atol=1e-5 * scale)

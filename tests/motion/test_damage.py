@@ -1,0 +1,364 @@
+"""Damaged and hostile files: one line, status 2, nothing written, no hang."""
+
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import motion_files as files
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from dcc_jax.motion import importer
+from dcc_jax.motion.__main__ import main
+from dcc_jax.motion.importer import Options
+from dcc_jax.motion.npz import MotionError
+
+
+def run(capsys, *arguments: object) -> tuple[int, str, str]:
+    """Status, stdout and stderr of the command."""
+    try:
+        status = main([str(argument) for argument in arguments])
+    except SystemExit as stop:
+        status = int(stop.code or 0)
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+def refused(capsys, folder: Path, name: str, data: str | bytes) -> str:
+    """The one line with which the command refuses a file."""
+    source = folder / name
+    source.write_bytes(data.encode() if isinstance(data, str) else data)
+    before = sorted(folder.iterdir())
+    status, _, err = run(capsys, "import", source, "--out", folder / "out.npz")
+    assert status == 2, err
+    assert sorted(folder.iterdir()) == before
+    assert err.startswith(str(source)) and err.count("\n") == 1
+    return err
+
+
+def bvh_with(old: str, new: str, count: int = 1) -> str:
+    text = files.bvh(frames=4)
+    assert old in text
+    return text.replace(old, new, count)
+
+
+def last_number_as(token: str) -> str:
+    head, _, _ = files.bvh(frames=4).rstrip().rpartition(" ")
+    return f"{head} {token}\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "the file is empty"),
+        ("hello", "the format is none of"),
+        (bvh_with("MOTION", "MOTIN"), "has no MOTION section"),
+        (bvh_with("Frames: 4", "Frames: 0"), "claims 0 frames"),
+        (bvh_with("Frames: 4", "Frames: 1000000000"), "claims 1000000000 frames of"),
+        (bvh_with("Frames: 4", "Frames: 5"), "claims 5 frames of"),
+        (bvh_with("Frames: 4", "Frames: many"), "expected a number"),
+        (bvh_with("Frame Time: 0.0", "Frame Time: -0.0"), "frame time"),
+        (bvh_with("CHANNELS 3", "CHANNELS 9"), "9 channels"),
+        (bvh_with("Xrotation", "Wrotation"), "unknown channel"),
+        (bvh_with("OFFSET", "OFFSET nan"), "not finite"),
+        (bvh_with("JOINT mixamorig:Head", "JOINT mixamorig:Spine"), "not unique"),
+        (bvh_with("mixamorig:LeftLeg", "mixamorig:Stick"), "no joint for left_shin"),
+        (bvh_with("}\nMOTION", "}}\nMOTION"), "unexpected '}}'"),
+        (last_number_as("nan"), "not finite"),
+        (last_number_as("1e999"), "not finite"),
+        (last_number_as("0x1f"), "expected a number"),
+        (last_number_as(""), "but holds"),
+        ("HIERARCHY\n" + "ROOT a\n{\nOFFSET 0 0 0\n" * 5000 + "MOTION\n", "unexpected"),
+        (
+            "HIERARCHY ROOT a { OFFSET 0 0 0\n"
+            + "".join(f"JOINT j{k} {{ OFFSET 0 0 0\n" for k in range(5000))
+            + "MOTION\n",
+            "more than 1000 joints",
+        ),
+    ],
+)
+def test_a_damaged_bvh_is_refused(capsys, tmp_path, text, reason):
+    assert reason in refused(capsys, tmp_path, "bad.bvh", text)
+
+
+def amc_with(old: str, new: str) -> str:
+    text = files.amc(frames=4)
+    assert old in text
+    return text.replace(old, new, 1)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (":FULLY-SPECIFIED\n:DEGREES\n", "holds no frames"),
+        (amc_with("\n3\n", "\n7\n"), "frame 7 follows frame 2"),
+        (amc_with("ltibia 0.0", "ltibia 0.0 1.0"), "has 2 values, not 1"),
+        (amc_with("ltibia 0.0", "ltibia nan"), "'nan' is not finite"),
+        (amc_with("ltibia 0.0", "ltibia zero"), "expected a number"),
+        (amc_with("ltibia 0.0", "tail 0.0"), "unknown bone 'tail'"),
+        (amc_with("ltibia 0.0", "lfemur 0 0 0"), "out of place"),
+        (files.amc(frames=4) + "\x00\x01", "binary data"),
+    ],
+)
+def test_a_damaged_amc_is_refused(capsys, tmp_path, text, reason):
+    (tmp_path / "07.asf").write_text(files.asf())
+    assert reason in refused(capsys, tmp_path, "07_01.amc", text)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        ("root lhipjoint", "rfoot lhipjoint", "does not hang on the root"),
+        ("lfemur ltibia", "lfemur ltibia\n ltibia lfemur", "has two parents"),
+        ("axis XYZ", "axis XXY", "unknown order of axes"),
+        ("length 7.4", "length inf", "not finite"),
+        ("length 0.45", "length -1", "unit of length"),
+        (":bonedata", ":bones", "no :bonedata"),
+        ("dof rx ry rz", "dof rx ry rw", "unknown dof"),
+        ("lfemur ltibia", "lfemur shinbone", "unknown bone 'shinbone'"),
+    ],
+)
+def test_a_damaged_skeleton_is_refused(capsys, tmp_path, old, new, reason):
+    assert old in files.asf()
+    source, skeleton = tmp_path / "07_01.amc", tmp_path / "07.asf"
+    source.write_text(files.amc(frames=4))
+    skeleton.write_text(files.asf().replace(old, new, 1))
+    status, _, err = run(capsys, "import", source, "--out", tmp_path / "out.npz")
+    assert status == 2 and reason in err and err.count("\n") == 1
+    assert err.startswith(str(skeleton))
+    assert not (tmp_path / "out.npz").exists()
+
+
+def test_a_motion_without_any_skeleton_is_refused(capsys, tmp_path):
+    assert "needs its skeleton" in refused(capsys, tmp_path, "1.amc", files.amc(2))
+
+
+def deepmimic(frames: int = 4, **changes: object) -> dict:
+    """A standing DeepMimic clip."""
+    one = [1.0, 0.0, 0.0, 0.0]
+    frame = [0.03, 0, 0.9, 0] + one * 3 + one + [-0.1] + one * 2 + [0.2]
+    frame += one + [-0.1] + one * 2 + [0.2]
+    return {"Loop": "none", "Frames": [frame] * frames, **changes}
+
+
+@pytest.mark.parametrize(
+    ("document", "reason"),
+    [
+        ({"Loop": "wrap"}, "no 'Frames'"),
+        (deepmimic(0), "holds no frames"),
+        (deepmimic(1), "needs 2 frames"),
+        (deepmimic(Frames=[[0.0] * 43] * 2), "has 43 numbers, not 44"),
+        (deepmimic(Frames=[["1"] * 44] * 2), "what is not a number"),
+        (deepmimic(Frames=[[float("nan")] * 44] * 2), "not finite"),
+        (deepmimic(Frames=[[0.03] + [0.0] * 43] * 2), "quaternion of norm 0"),
+        (deepmimic(Frames=[[0.0] + [1.0] * 43] * 2), "frame 0 lasts 0.0 s"),
+    ],
+)
+def test_a_damaged_deepmimic_clip_is_refused(capsys, tmp_path, document, reason):
+    line = refused(capsys, tmp_path, "clip.txt", json.dumps(document))
+    assert reason in line
+
+
+def test_json_that_is_no_json_is_refused(capsys, tmp_path):
+    assert ":1: not JSON" in refused(capsys, tmp_path, "clip.txt", '{"Frames": [[')
+    nested = '{"Frames": ' + "[" * 100_000
+    assert "not JSON" in refused(capsys, tmp_path, "clip.txt", nested)
+
+
+def poselib(**changes: object) -> bytes:
+    """A poselib archive of one standing figure with some arrays exchanged."""
+    rows = files.FIGURE
+    arrays = {
+        "fps": np.array(60),
+        "is_local": np.array(True),
+        "node_names": np.array([name for name, _, _ in rows]),
+        "parent_indices": np.array([parent for _, parent, _ in rows]),
+        "local_translation": np.array([offset for _, _, offset in rows]),
+        "root_translation": np.tile([0.0, 0.0, 0.98], (30, 1)),
+        "rotation_xyzw": np.tile([0.0, 0.0, 0.0, 1.0], (30, len(rows), 1)),
+    } | changes
+    stream = io.BytesIO()
+    np.savez(
+        stream, **{key: value for key, value in arrays.items() if value is not None}
+    )
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (poselib(fps=None), "lacks fps"),
+        (poselib(node_names=np.array([print] * 22)), "pickled objects"),
+        (
+            poselib(parent_indices=np.array([-1, *range(2, 23)])),
+            "cannot have the parent",
+        ),
+        (poselib(parent_indices=np.arange(22)), "cannot have the parent 0"),
+        (poselib(rotation_xyzw=np.ones((30, 3, 4))), "rotation_xyzw is"),
+        (poselib(rotation_xyzw=np.zeros((30, 22, 4))), "far from unit length"),
+        (poselib(root_translation=np.full((30, 3), np.inf)), "not finite"),
+        (poselib(fps=np.array(0.0)), "frame rate 0.0 is not credible"),
+        (poselib()[:-40], "not a readable npz archive"),
+        (b"PK\x03\x04 not really a zip", "not a readable npz archive"),
+    ],
+)
+def test_a_damaged_poselib_archive_is_refused(capsys, tmp_path, data, reason):
+    assert reason in refused(capsys, tmp_path, "clip.npz", data)
+
+
+def test_a_bomb_is_not_unpacked(capsys, tmp_path):
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in ("a.npy", "b.npy"):
+            with archive.open(name, "w") as member:
+                for _ in range(520):
+                    member.write(bytes(1 << 20))
+    line = refused(capsys, tmp_path, "bomb.npz", stream.getvalue())
+    assert "unpacks to more than 1024 MiB" in line
+
+
+def test_several_sources_are_imported_and_the_bad_one_is_named(capsys, tmp_path):
+    good, bad = tmp_path / "good.bvh", tmp_path / "bad.bvh"
+    good.write_text(files.bvh(frames=20))
+    bad.write_text(files.bvh(frames=20)[:-300])
+    out = tmp_path / "clips"
+    status, stdout, err = run(capsys, "import", good, bad, "--out", out, "--mirror")
+    assert status == 2 and f"{bad}:" in err
+    assert sorted(path.name for path in out.iterdir()) == [
+        "good.npz",
+        "good_mirrored.npz",
+    ]
+    assert "foot skate in stance" in stdout
+    status, stdout, _ = run(capsys, "inspect", out / "good.npz")
+    assert status == 0 and "penetration" in stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["--fps", "0"], "argument --fps"),
+        (["--unit", "furlong"], "argument --unit"),
+        (["--trim", "3:1"], "argument --trim"),
+        (["--up", "w"], "argument --up"),
+        (["--map", "none.txt"], "none.txt: cannot be read"),
+    ],
+)
+def test_a_bad_argument_is_one_line(capsys, tmp_path, arguments, reason):
+    source = tmp_path / "a.bvh"
+    source.write_text(files.bvh(frames=4))
+    out = tmp_path / "out.npz"
+    status, _, err = run(capsys, "import", source, "--out", out, *arguments)
+    assert status == 2 and reason in err and err.count("\n") == 1
+    assert not out.exists()
+
+
+def test_inspecting_what_is_no_clip_is_one_line(capsys, tmp_path):
+    path = tmp_path / "no.npz"
+    path.write_bytes(poselib())
+    status, _, err = run(capsys, "inspect", path)
+    assert status == 2 and err == f"{path}: not a clip (its layout is not " + (
+        "'dcc_jax clip 1')\n"
+    )
+
+
+REAL = [
+    files.MOTIONS / "cmu_asfamc" / "02_03.amc",
+    files.MOTIONS / "cmu_asfamc" / "02.asf",
+    files.MOTIONS / "mass_bvh" / "run.bvh",
+    files.MOTIONS / "deepmimic" / "humanoid3d_jog.txt",
+    files.MOTIONS / "amp_poselib_npz" / "amp_humanoid_run.npz",
+]
+SEEDS = {
+    "seed_1.amc": files.amc(frames=6).encode(),
+    "seed.asf": files.asf().encode(),
+    "seed.bvh": files.bvh(frames=6).encode(),
+    "seed.txt": json.dumps(deepmimic()).encode(),
+    "seed.npz": poselib(),
+}
+LONGEST = 30.0  # s of processor time; an import takes about 1
+BYTES = st.one_of(
+    st.binary(max_size=6),
+    st.sampled_from(
+        [b"nan", b"-1", b"1e308", b"{", b"}", b"\n", b" ", b"0", b"[", b":"]
+    ),
+)
+EDITS = st.lists(
+    st.tuples(st.floats(0.0, 1.0), st.integers(0, 40), BYTES), min_size=1, max_size=3
+)
+
+
+def mutated(data: bytes, edits, end: float) -> bytes:
+    """The data with stretches replaced, then cut at a share of its length."""
+    for place, length, new in edits:
+        at = int(place * len(data))
+        data = data[:at] + new + data[at + length :]
+    return data[: int(end * len(data))] if end < 1.0 else data
+
+
+def survives(folder: Path, name: str, data: bytes, skeleton: bytes) -> None:
+    """Reading the data gives a clip or a MotionError of one line."""
+    (folder / "seed.asf").write_bytes(skeleton)
+    path = folder / name
+    path.write_bytes(data)
+    motion = path if path.suffix != ".asf" else folder / "seed_1.amc"
+    if not motion.exists():
+        motion.write_bytes(SEEDS["seed_1.amc"])
+    before = time.process_time()
+    try:
+        importer.import_motion(motion, Options())
+    except MotionError as error:
+        assert "\n" not in str(error) and str(error).startswith(str(folder))
+    assert time.process_time() - before < LONGEST
+
+
+@pytest.mark.parametrize("name", SEEDS)
+@settings(
+    max_examples=15,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(edits=EDITS, end=st.one_of(st.just(1.0), st.floats(0.0, 1.0)))
+def test_no_mutation_of_a_small_file_crashes(tmp_path, name, edits, end):
+    survives(tmp_path, name, mutated(SEEDS[name], edits, end), SEEDS["seed.asf"])
+
+
+@pytest.mark.skipif(not REAL[0].exists(), reason="no motion data here")
+@pytest.mark.parametrize("source", REAL, ids=lambda path: path.name)
+@settings(
+    max_examples=6,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(edits=EDITS, end=st.one_of(st.just(1.0), st.floats(0.0, 1.0)))
+def test_no_mutation_of_a_real_file_crashes(tmp_path, source, edits, end):
+    name = "seed.asf" if source.suffix == ".asf" else f"seed_1{source.suffix}"
+    data = mutated(source.read_bytes(), edits, end)
+    skeleton = data if source.suffix == ".asf" else REAL[1].read_bytes()
+    if source.suffix == ".asf":
+        (tmp_path / "seed_1.amc").write_bytes(REAL[0].read_bytes())
+    survives(tmp_path, name, data, skeleton)
+
+
+@pytest.mark.parametrize("name", ["seed.bvh", "seed_1.amc", "seed.txt", "seed.npz"])
+def test_every_truncation_is_survived(tmp_path, monkeypatch, name):
+    """At every byte; the retargeting of what still reads is tested elsewhere."""
+    monkeypatch.setattr(importer, "_imported", lambda motion, options: motion)
+    data = SEEDS[name] if name != "seed_1.amc" else files.amc(frames=2).encode()
+    step = max(1, len(data) // 400)
+    for length in range(0, len(data), step):
+        survives(tmp_path, name, data[:length], SEEDS["seed.asf"])
+
+
+def test_importers_need_no_jax():
+    code = "import sys, dcc_jax.motion.importer; sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0

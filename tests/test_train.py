@@ -1,0 +1,147 @@
+"""The command: bad input is one line and status 2, never a traceback."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import pytest
+
+from dcc_jax import config, options, training
+
+# The package shows the function of that name; these tests want the module.
+train = importlib.import_module("dcc_jax.train")
+
+SMOKE = ["--task", "push", "--preset", "smoke"]
+
+
+def _said(capsys: pytest.CaptureFixture[str], argv: list[str]) -> str:
+    assert train.main(argv) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    return lines[0]
+
+
+@pytest.mark.parametrize(
+    ("argv", "parts"),
+    [
+        ([], ["--task is required"]),
+        (["--task", "fly", "--preset", "smoke"], ["task must be", "push", "'fly'"]),
+        ([*SMOKE, "--bogus", "3"], ["--bogus"]),
+        (["--task", "push", "--preset", "big"], ["smoke, cpu, gpu, paper", "'big'"]),
+        ([*SMOKE, "--ppo.learning-rate", "fast"], ["learning-rate", "fast"]),
+        ([*SMOKE, "--train.num-envs", "0"], ["num_envs must be 1 or more", "0"]),
+        ([*SMOKE, "--env.clips", "/none/a.npz"], ["/none/a.npz"]),
+        ([*SMOKE, "--resume"], ["--resume needs --run-dir"]),
+        ([*SMOKE, "--ppo.minibatch-size", "100"], ["ppo.minibatch_size", "100"]),
+    ],
+)
+def test_bad_argument_is_one_line_and_status_two(argv, parts, capsys, tmp_path):
+    where = [] if "--resume" in argv else ["--run-dir", str(tmp_path / "run")]
+    line = _said(capsys, [*argv, *where])
+    for part in parts:
+        assert part in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_environments_that_devices_cannot_share_are_one_line(capsys, tmp_path):
+    if len(jax.devices()) == 1:
+        pytest.skip("one device shares any number of environments")
+    argv = [*SMOKE, "--train.num-envs", "17", "--run-dir", str(tmp_path / "run")]
+    assert "num_envs must be a multiple of the" in _said(capsys, argv)
+
+
+def test_directory_that_is_not_a_run_is_one_line(capsys, tmp_path):
+    argv = ["--resume", "--run-dir", str(tmp_path)]
+    assert "is not a run directory" in _said(capsys, argv)
+
+
+def test_run_directory_in_use_is_not_overwritten(capsys, tmp_path):
+    (tmp_path / "precious.txt").write_text("keep")
+    line = _said(capsys, [*SMOKE, "--run-dir", str(tmp_path)])
+    assert "is not empty" in line
+    assert [p.name for p in tmp_path.iterdir()] == ["precious.txt"]
+
+
+def test_resumed_run_cannot_change_its_networks(capsys, tmp_path):
+    (tmp_path / "config.json").write_text(
+        config.to_json(config.make_config("push", "smoke"))
+    )
+    argv = ["--resume", "--run-dir", str(tmp_path), "--ppo.hidden", "64", "64"]
+    line = _said(capsys, argv)
+    assert "ppo.hidden is (32, 32)" in line and "(64, 64)" in line
+
+
+def test_resumed_run_may_train_longer(tmp_path):
+    made = config.make_config("push", "smoke")
+    (tmp_path / "config.json").write_text(config.to_json(made))
+    said = options.parse(
+        ["--resume", "--run-dir", str(tmp_path), "--train.total-tuples", "9000"]
+    )
+    assert said.resume and said.run_dir == tmp_path
+    longer = dataclasses.replace(made.train, total_tuples=9000)
+    assert said.config == dataclasses.replace(made, train=longer)
+
+
+def test_options_override_the_preset():
+    said = options.parse(
+        [*SMOKE, "--seed", "7", "--ppo.learning-rate", "3e-4", "--env.alpha", "0.04"]
+    )
+    made = config.make_config("push", "smoke")
+    assert said.config.seed == 7
+    assert said.config.ppo == dataclasses.replace(made.ppo, learning_rate=3e-4)
+    assert said.config.env == dataclasses.replace(made.env, alpha=0.04)
+
+
+def test_help_explains_every_option(capsys):
+    with pytest.raises(SystemExit) as stop:
+        options.parse(["--help", "--preset", "paper"])
+    assert stop.value.code == 0
+    text = " ".join(capsys.readouterr().out.split())
+    for option in ("--run-dir", "--resume", "--seed", "--env.alpha", "--disc.hidden"):
+        assert option in text
+    for source in ("Sec. 5.1", "Schulman 2017", "(default: 1e-05)"):
+        assert source in text
+    for section in (config.Config, *config.Config.__dataclass_fields__):
+        assert section
+
+
+def test_command_leaves_with_status_two():
+    done = subprocess.run(
+        [sys.executable, "-m", "dcc_jax.train", "--task", "push", "--bogus", "3"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert "Unrecognized options: --bogus" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_failed_run_is_one_line_and_status_one(monkeypatch, capsys, tmp_path):
+    def fail(run: training.Run) -> None:
+        raise training.RunError("disk full")
+
+    monkeypatch.setattr(training, "execute", fail)
+    monkeypatch.setattr(training, "make_environment", lambda wanted: None)
+    assert train.main([*SMOKE, "--run-dir", str(tmp_path / "run")]) == 1
+    assert capsys.readouterr().err == "dcc_jax.train: disk full\n"
+
+
+def test_error_nobody_foresaw_is_one_line_with_details_in_a_file(
+    monkeypatch, capsys, tmp_path
+):
+    def fail(run: training.Run) -> None:
+        raise ZeroDivisionError("one over zero\nand more")
+
+    monkeypatch.setattr(training, "execute", fail)
+    monkeypatch.setattr(training, "make_environment", lambda wanted: None)
+    run_dir: Path = tmp_path / "run"
+    assert train.main([*SMOKE, "--run-dir", str(run_dir)]) == 1
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and "ZeroDivisionError: one over zero" in lines[0]
+    assert "and more" in (run_dir / "error.log").read_text()

@@ -1,0 +1,49 @@
+"""Trains the toy in a process of its own: `toy_run.py RUN_DIR [--resume] [UPDATES]`."""
+
+from __future__ import annotations
+
+import sys
+
+from dcc_jax import runtime
+
+INTERVAL = 10
+
+
+def toy_config(updates: int):
+    """The toy under the real configuration's roof."""
+    import dataclasses
+
+    from toy import ToyConfig
+
+    from dcc_jax.config import Config
+
+    small = ToyConfig()
+    return Config(
+        task="toy",
+        ppo=small.ppo,
+        disc=small.disc,
+        train=dataclasses.replace(
+            small.train,
+            total_tuples=updates * small.train.tuples_per_update,
+            checkpoint_interval=INTERVAL,
+        ),
+    )
+
+
+def main(arguments: list[str]) -> int:
+    runtime.setup()
+    from toy import Toy
+
+    from dcc_jax import training
+
+    resume = "--resume" in arguments
+    run_dir, updates = (a for a in arguments if a != "--resume")
+    result = training.train(
+        toy_config(int(updates)), run_dir=run_dir, resume=resume, environment=Toy()
+    )
+    print("finished" if result.finished else "stopped")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))
