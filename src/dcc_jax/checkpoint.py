@@ -97,9 +97,12 @@ def restore_latest(
 
 
 def to_arrays(tree: Any) -> dict[str, np.ndarray]:
-    """Every leaf as a host array by its path, random keys as their data."""
+    """Every leaf as a host array by its path, random keys as their data.
+
+    Leaves of no elements are left out: orbax refuses them.
+    """
     leaves = jax.tree_util.tree_leaves_with_path(tree)
-    return {_name(path): np.asarray(_raw(leaf)) for path, leaf in leaves}
+    return {_name(path): np.asarray(_raw(leaf)) for path, leaf in leaves if leaf.size}
 
 
 def from_arrays(arrays: dict[str, np.ndarray], template: Any) -> Any:
@@ -110,10 +113,15 @@ def from_arrays(arrays: dict[str, np.ndarray], template: Any) -> Any:
     """
     leaves, tree = jax.tree_util.tree_flatten_with_path(template)
     named = [(_name(path), leaf) for path, leaf in leaves]
-    missing = sorted({name for name, _ in named} ^ arrays.keys())
+    missing = sorted({name for name, leaf in named if leaf.size} ^ arrays.keys())
     if missing:
         raise ValueError(f"the checkpoint does not fit this run: {missing[0]}")
-    restored = [_restored(name, arrays[name], leaf) for name, leaf in named]
+    restored = [
+        _restored(name, arrays[name], leaf)
+        if leaf.size
+        else np.zeros(leaf.shape, leaf.dtype)
+        for name, leaf in named
+    ]
     return jax.tree_util.tree_unflatten(tree, restored)
 
 
