@@ -46,6 +46,9 @@ class Task:
     has_reward: ClassVar[bool] = False
     extra_actions: ClassVar[int] = 0
     state_size: ClassVar[int] = 0
+    clock: ClassVar[str | None] = None
+    """The entry of `evaluate`, in s since an event (a throw, a landing), over which an
+    evaluation draws its curves; None: over the time since the reset."""
 
     def extend(self, spec: mujoco.MjSpec) -> None:
         """Adds bodies and contact pairs to the scene of character and floor."""
@@ -105,6 +108,17 @@ class Task:
     ) -> Array:
         """Height in m of what the character stands on, for the fall test."""
         return jnp.zeros(())
+
+    def evaluate(
+        self, scene: physics.Scene, state: Any, body: physics.State
+    ) -> dict[str, Array]:
+        """The task's own numbers [] at the end of a control step, by name.
+
+        `dcc_jax.evaluate` reduces each over an episode to `<name>/mean`, `/min`, `/max`
+        and `/final`. What has to be measured at the physics rate is noted in the state
+        by `forces`. Booleans become shares of the time.
+        """
+        return {}
 
 
 def place_character(scene: physics.Scene, reference: RefState) -> tuple[Array, Array]:
