@@ -33,7 +33,7 @@ import jax.numpy as jnp  # noqa: E402
 import mujoco  # noqa: E402
 import mujoco.rollout  # noqa: E402
 import numpy as np  # noqa: E402
-from jax.sharding import Mesh, PartitionSpec  # noqa: E402
+from jax.sharding import Mesh, NamedSharding, PartitionSpec  # noqa: E402
 from mujoco import mjx  # noqa: E402
 
 from dcc_jax import physics  # noqa: E402
@@ -118,6 +118,7 @@ def sharded(step: Callable, carry: object) -> tuple[Callable, float]:
     mapped = jax.shard_map(
         chunk, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
     )
+    carry = jax.device_put(carry, NamedSharding(mesh, spec))
     begin = time.perf_counter()
     compiled = jax.jit(mapped).lower(carry).compile()
     return (
