@@ -146,6 +146,22 @@ def test_initial_state_has_the_pose_of_one_control_step_ago(states):
     )
 
 
+def test_a_loop_travels_at_its_mean_velocity_and_other_clips_do_not(refs, states):
+    # The chord of one period on the circle of 2 m, then turned by what it turns.
+    chord, angle = 4.0 * np.sin(0.65), 0.65
+    for periods in (0, 2):
+        travel = refs.state_at(1, periods + 0.3).travel
+        heading = angle + 1.3 * periods
+        expected = [chord * np.cos(heading), chord * np.sin(heading)]
+        np.testing.assert_allclose(travel, expected, atol=1e-3)
+    assert not np.any(refs.state_at(0, 0.5).travel)
+    plain, moved = states
+    going = plain.clip == 1
+    speeds = np.linalg.norm(moved.travel[going], axis=-1)
+    np.testing.assert_allclose(speeds, chord, rtol=1e-3)
+    assert np.ptp(np.arctan2(*moved.travel[going].T)) > 3.0
+
+
 def test_random_heading_turns_pose_and_velocity_together(states):
     plain, moved = states
     turn = Rotation.from_quat(moved.qpos[:, 3:7], scalar_first=True) * (

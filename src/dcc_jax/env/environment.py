@@ -24,7 +24,7 @@ from dcc_jax.control import compliance, pd
 from dcc_jax.control.compliance import ComplianceConfig, Displacement
 from dcc_jax.env import features, rewards
 from dcc_jax.env.rewards import RewardConfig
-from dcc_jax.env.task import Forces, Task
+from dcc_jax.env.task import Forces, RootTarget, Task
 from dcc_jax.motion.reference import References, RefState
 
 Array = jax.Array
@@ -127,7 +127,7 @@ class EnvState:
     displacement: Displacement  # of the character
     u_previous: Array  # [55] one control step ago
     q_previous: Array  # [55] the character's coordinates then
-    origin: Array  # [2] m, where the root of the reference stays
+    start: RootTarget  # of the reference, at the reset
     alpha: Array  # []
     time: Array  # [] s since the reset
     task: Any
@@ -180,7 +180,7 @@ class Environment:
         )
 
     action_size = property(lambda self: 36 + self.task.extra_actions)
-    observation_size = property(lambda self: 270 + 36 + 3 + 1 + self.task.state_size)
+    observation_size = property(lambda self: 270 + 36 + 4 + 1 + self.task.state_size)
     feature_size = property(lambda self: 270)
     condition_size = property(lambda self: 0)
     has_task_reward = property(lambda self: self.task.has_reward)
@@ -215,7 +215,7 @@ class Environment:
             displacement=displacement,
             u_previous=displacement.u,
             q_previous=reference.qpos_previous,
-            origin=reference.qpos[:2],
+            start=RootTarget(reference.qpos[:2], reference.travel),
             alpha=self._alpha(alpha_key) if alpha is None else jnp.asarray(alpha),
             time=zero,
             task=task,
@@ -278,7 +278,7 @@ class Environment:
         kin = physics.kinematics(scene, carry.body, world)
         tau = self._torque(carry, action)
         qfrc = scene.scatter_character(tau)
-        qfrc = qfrc + task.applied(scene, carry.task, carry.time)
+        qfrc = qfrc + task.applied(scene, carry.task, kin, carry.time)
         solution = physics.solve(scene, kin, carry.body, qfrc)
         task_state, forces = task.forces(scene, carry.task, kin, solution, action)
         displacement = self._displaced(carry, kin, forces, alpha)
@@ -350,14 +350,13 @@ class Environment:
         numbers = features.state(
             self.kinematics, q, state.q_previous, state.displacement.u, state.u_previous
         )
-        _, heading = features.local_frame(q)
-        offset = jnp.concatenate([state.origin, jnp.zeros(1)])
-        target = offset + state.displacement.u[:3] - q[:3]
-        target = quat.rotate(quat.inv(heading), target * jnp.array([1.0, 1.0, 0.0]))
+        target = self._root_target(state)
+        offset = target.position + state.displacement.u[:2] - q[:2]
         obs = jnp.concatenate(
             [
                 numbers,
-                target,
+                _seen_from(q, offset),
+                _seen_from(q, target.velocity),
                 state.alpha[None],
                 self.task.observe(self.scene, state.task, state.body),
             ]
@@ -370,14 +369,18 @@ class Environment:
             previous_features=jnp.where(first, body_features, state.previous_features),
         )
 
+    def _root_target(self, state: EnvState) -> RootTarget:
+        return self.task.root_target(self.scene, state.task, state.start, state.time)
+
     def _judged(self, state: EnvState) -> EnvState:
         """Fills in rewards and endings."""
         scene, config = self.scene, self.config
         q = scene.character_qpos(state.body.qpos)
         qd = scene.character_qvel(state.body.qvel)
+        target = self._root_target(state)
         r_p = rewards.position_reward(
-            q[:2] - state.origin,
-            qd[:2],
+            q[:2] - target.position,
+            qd[:2] - target.velocity,
             state.displacement.u[:2],
             state.displacement.ud[:2],
             config.reward,
@@ -427,6 +430,12 @@ def _at_origin(reference: RefState) -> RefState:
     return reference.replace(
         qpos=reference.qpos - shift, qpos_previous=reference.qpos_previous - shift
     )
+
+
+def _seen_from(q: Array, vector: Array) -> Array:
+    """A vector [2] on the ground in the local frame of the character's q [55]."""
+    _, heading = features.local_frame(q)
+    return quat.rotate(quat.inv(heading), jnp.append(vector, 0.0))[:2]
 
 
 def _contained(new: EnvState, old: EnvState) -> EnvState:

@@ -32,6 +32,14 @@ class Forces:
 
 
 @flax.struct.dataclass
+class RootTarget:
+    """Where the reference's root is over the ground, and how fast it moves."""
+
+    position: Array  # [2] m, world
+    velocity: Array  # [2] m/s
+
+
+@flax.struct.dataclass
 class Nothing:
     """The state of a task that has none."""
 
@@ -70,7 +78,25 @@ class Task:
         """What happens once a control step, before the physics: throws, schedules."""
         return state, body
 
-    def applied(self, scene: physics.Scene, state: Any, time: Array) -> Array:
+    def root_target(
+        self, scene: physics.Scene, state: Any, start: RootTarget, time: Array
+    ) -> RootTarget:
+        """The reference's root at a moment, which r_p compares the root with (Eq. 14).
+
+        Here: where the episode began, going on at the mean velocity of its clip where
+        that is a loop that travels, such as a walk; at rest with every other clip.
+
+        Args:
+            scene: static.
+            state: the task's own.
+            start: at the reset, the mean velocity of a loop with it.
+            time: s since the reset.
+        """
+        return start.replace(position=start.position + time * start.velocity)
+
+    def applied(
+        self, scene: physics.Scene, state: Any, kin: physics.Kinematics, time: Array
+    ) -> Array:
         """Generalized forces of the surroundings on the scene [nv], every substep."""
         return jnp.zeros(scene.model.nv)
 

@@ -36,6 +36,7 @@ class RefState:
     qpos_previous: Array  # [55] one control step ago
     clip: Array  # [] int32, which clip
     time: Array  # [] s, since the start of the clip
+    travel: Array  # [2] m/s, mean velocity of a loop over the ground; else zero
 
 
 @struct.dataclass
@@ -98,6 +99,7 @@ class References:
             qpos_previous=self.qpos_at(clip, time - self.control_dt),
             clip=jnp.asarray(clip, jnp.int32),
             time=time,
+            travel=self._travel(clip, time),
         )
 
     def sample(
@@ -127,6 +129,7 @@ class References:
             qpos=planar_moved(state.qpos, turn, shift),
             qpos_previous=planar_moved(state.qpos_previous, turn, shift),
             qvel=state.qvel.at[ROOT_LINEAR].set(linear),
+            travel=_turned(turn, state.travel),
         )
 
     def sample_windows(self, key: Array, count: int) -> Array:
@@ -147,6 +150,12 @@ class References:
         times = start[:, None] + self.control_dt * jnp.arange(3)
         at = jax.vmap(jax.vmap(self.qpos_at, (None, 0)))
         return at(clip, times), self.label[clip]
+
+    def _travel(self, clip: Array | int, time: Array) -> Array:
+        cycle, _, _ = self._place(clip, time)
+        mean = self.shift[clip] / self.duration[clip]
+        moves = jnp.where(self.loop[clip], mean, 0.0)
+        return _turned(cycle * self.turn[clip], moves)
 
     def _draw(self, key: Array, shape: tuple[int, ...]) -> Array:
         return jax.random.categorical(key, jnp.log(self.weight), shape=shape)
@@ -238,6 +247,14 @@ def _about_z(angle: Array) -> Array:
     return jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)], axis=-1)
 
 
+def _turned(angle: Array, vector: Array) -> Array:
+    """A vector [2] on the ground turned by `angle`."""
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    return jnp.stack(
+        [cos * vector[0] - sin * vector[1], sin * vector[0] + cos * vector[1]]
+    )
+
+
 def _repeated(count: Array, turn: Array, shift: Array) -> tuple[Array, Array]:
     """`count` times the planar motion p -> Rz(turn) p + shift.
 
@@ -248,12 +265,7 @@ def _repeated(count: Array, turn: Array, shift: Array) -> tuple[Array, Array]:
     small = jnp.abs(jnp.sin(half)) < 1e-6
     ratio = jnp.sin(count * half) / jnp.where(small, 1.0, jnp.sin(half))
     ratio = jnp.where(small, count, ratio)
-    direction = (count - 1.0) * half
-    cos, sin = jnp.cos(direction), jnp.sin(direction)
-    rotated = jnp.stack(
-        [cos * shift[0] - sin * shift[1], sin * shift[0] + cos * shift[1]]
-    )
-    return count * turn, ratio * rotated
+    return count * turn, ratio * _turned((count - 1.0) * half, shift)
 
 
 def _phase(clip: Clip) -> np.ndarray:

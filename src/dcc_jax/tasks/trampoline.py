@@ -111,7 +111,9 @@ class Trampoline(Task):
         left = jnp.where(over, state.next_bounce + self.interval, state.next_bounce)
         return state.replace(next_bounce=left - 1.0 / 30.0), body
 
-    def applied(self, scene: physics.Scene, state: State, time: Array) -> Array:
+    def applied(
+        self, scene: physics.Scene, state: State, kin: physics.Kinematics, time: Array
+    ) -> Array:
         """The weights that the springs' rest position carries, and the kick."""
         weight = GRAVITY * float(scene.model.body_mass.sum())
         kicking = state.next_bounce <= 0.0
