@@ -71,6 +71,9 @@ class Toy:
         s = 0.2 * jax.random.normal(key, (n, 2))
         return s, 0.7 * s, jnp.zeros((n, 0))
 
+    def style_coordinates(self, s: Array, s_next: Array) -> Array:
+        return jnp.concatenate([s, s_next], axis=-1)
+
     def _state(
         self, position: Array, before: Array, alpha: Array, time: Array
     ) -> ToyState:

@@ -22,7 +22,8 @@ from dcc_jax import physics, quat
 from dcc_jax.character import Character, compose_scene
 from dcc_jax.control import compliance, pd
 from dcc_jax.control.compliance import ComplianceConfig, Displacement
-from dcc_jax.env import features, rewards
+from dcc_jax.env import features, metrics, pairs, rewards
+from dcc_jax.env.metrics import Metrics, Sums
 from dcc_jax.env.rewards import RewardConfig
 from dcc_jax.env.task import Forces, RootTarget, Task
 from dcc_jax.motion.reference import References, RefState
@@ -99,17 +100,6 @@ class EnvConfig:
 
 
 @flax.struct.dataclass
-class Metrics:
-    """Of one control step, measured at the physics rate."""
-
-    force_peak: Array  # [] N, largest force fed to the compliance
-    impulse: Array  # [] N s, of those forces
-    torque_rms: Array  # [] N m, over joints and substeps
-    displacement: Array  # [] rad, norm of log u over the joints
-    root_displacement: Array  # [] m, of u
-
-
-@flax.struct.dataclass
 class EnvState:
     """Everything that ONE environment carries, and what the learner reads of it."""
 
@@ -141,9 +131,7 @@ class _Substep:
     displacement: Displacement
     task: Any
     time: Array
-    force_peak: Array
-    impulse: Array
-    torque_square: Array
+    sums: Sums
 
 
 class Environment:
@@ -210,7 +198,7 @@ class Environment:
             terminated=jnp.zeros((), bool),
             truncated=jnp.zeros((), bool),
             nan=jnp.zeros((), bool),
-            metrics=Metrics(zero, zero, zero, zero, zero),
+            metrics=metrics.no_metrics(),
             body=body,
             displacement=displacement,
             u_previous=displacement.u,
@@ -231,15 +219,25 @@ class Environment:
             action: rotation vectors of the 12 joints from the nominal pose [36], rad,
                 then the task's extra actions.
         """
+        return self._step(key, state, action, record=False)[0]
+
+    def recorded_step(
+        self, key: Array, state: EnvState, action: Array
+    ) -> tuple[EnvState, Forces]:
+        """`step`, and the forces of its physics steps, leaves [substeps, ...]."""
+        return self._step(key, state, action, record=True)
+
+    def _step(
+        self, key: Array, state: EnvState, action: Array, record: bool
+    ) -> tuple[EnvState, Any]:
+        def substep(carry: _Substep, _: None) -> tuple[_Substep, Forces | None]:
+            carry, forces = self._substep(carry, action, state.alpha)
+            return carry, forces if record else None
+
         task, body = self.task.control_step(key, self.scene, state.task, state.body)
-        zero = jnp.zeros(())
-        start = _Substep(body, state.displacement, task, state.time, zero, zero, zero)
-        end, _ = jax.lax.scan(
-            lambda carry, _: (self._substep(carry, action, state.alpha), None),
-            start,
-            None,
-            length=self.config.control_steps,
-        )
+        start = _Substep(body, state.displacement, task, state.time, metrics.no_sums())
+        steps = self.config.control_steps
+        end, forces = jax.lax.scan(substep, start, None, length=steps)
         new = state.replace(
             body=end.body,
             displacement=end.displacement,
@@ -248,10 +246,12 @@ class Environment:
             q_previous=self.scene.character_qpos(state.body.qpos),
             u_previous=state.displacement.u,
             previous_features=state.features,
-            metrics=self._metrics(end),
+            metrics=metrics.metrics(
+                end.sums, steps, self.kinematics.coords, end.displacement.u
+            ),
         )
         new = self._judged(self._observed(new))
-        return _contained(new, state)
+        return _contained(new, state), forces
 
     def expert_pairs(self, key: Array, n: int) -> tuple[Array, Array, Array]:
         """(s, s') ~ M: features [n, 270] twice, and the condition [n, 0]."""
@@ -263,6 +263,10 @@ class Environment:
             jnp.zeros((n, 0)),
         )
 
+    def style_coordinates(self, s: Array, s_next: Array) -> Array:
+        """Pairs of features [..., 270] as points [..., 225] in m (`learn.style`)."""
+        return pairs.pair_coordinates(s, s_next, self.control_dt)
+
     def _features(self, q: Array, q_previous: Array) -> Array:
         return features.body_features(self.kinematics, q, q_previous)
 
@@ -272,7 +276,9 @@ class Environment:
             return jnp.asarray(low)
         return jax.random.uniform(key, minval=low, maxval=high)
 
-    def _substep(self, carry: _Substep, action: Array, alpha: Array) -> _Substep:
+    def _substep(
+        self, carry: _Substep, action: Array, alpha: Array
+    ) -> tuple[_Substep, Forces]:
         scene, task = self.scene, self.task
         world = task.world(scene, carry.task, carry.time)
         kin = physics.kinematics(scene, carry.body, world)
@@ -282,16 +288,25 @@ class Environment:
         solution = physics.solve(scene, kin, carry.body, qfrc)
         task_state, forces = task.forces(scene, carry.task, kin, solution, action)
         displacement = self._displaced(carry, kin, forces, alpha)
-        size = jnp.sqrt(jnp.sum(jnp.square(forces.force_w)) + 1e-12)
+        sums = metrics.add(
+            carry.sums,
+            jnp.where(forces.gate, forces.force_w, 0.0),
+            self._felt(tau, solution.qacc),
+            scene.character_qvel(carry.body.qvel)[6:],
+            scene.timestep,
+        )
         return _Substep(
             body=physics.integrate(scene, carry.body, solution),
             displacement=displacement,
             task=task_state,
             time=carry.time + scene.timestep,
-            force_peak=jnp.maximum(carry.force_peak, size),
-            impulse=carry.impulse + scene.timestep * size,
-            torque_square=carry.torque_square + jnp.mean(jnp.square(tau[6:])),
-        )
+            sums=sums,
+        ), forces
+
+    def _felt(self, tau: Array, qacc: Array) -> Array:
+        """Torques [36] of the joints: tau less the stable PD's implicit h kv qacc."""
+        implicit = jnp.asarray(self.scene.spd_diagonal, qacc.dtype) * qacc
+        return (tau - self.scene.character_qvel(implicit))[6:]
 
     def _torque(self, carry: _Substep, action: Array) -> Array:
         target = quat.oplus(self.kinematics.coords, self.nominal, self._offset(action))
@@ -396,16 +411,6 @@ class Environment:
             r_task=self.task.reward(scene, state.task, state.body),
             terminated=fallen | failed,
             truncated=state.time >= config.episode_seconds - 1e-4,
-        )
-
-    def _metrics(self, end: _Substep) -> Metrics:
-        u = quat.log_map(self.kinematics.coords, end.displacement.u)
-        return Metrics(
-            force_peak=end.force_peak,
-            impulse=end.impulse,
-            torque_rms=jnp.sqrt(end.torque_square / self.config.control_steps),
-            displacement=jnp.sqrt(jnp.sum(jnp.square(u[6:])) + 1e-12),
-            root_displacement=jnp.sqrt(jnp.sum(jnp.square(u[:3])) + 1e-12),
         )
 
 

@@ -1,0 +1,95 @@
+"""What a control step cost: forces, torques and u, measured at the physics rate."""
+
+from __future__ import annotations
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from dcc_jax import quat
+from dcc_jax.control.compliance import acting
+
+Array = jax.Array
+
+
+@flax.struct.dataclass
+class Metrics:
+    """Of one control step.
+
+    Forces are those that the compliance hears; while a task's gate is closed there are
+    none. Torques are what the joints feel, the stable PD's implicit part included.
+    """
+
+    force_peak: Array  # [] N, largest norm of all forces together
+    impulse: Array  # [] N s, integral of that norm
+    contact_share: Array  # [] share of the physics steps in which a force acts
+    torque_rms: Array  # [] N m, over the joints' axes and the physics steps
+    contact_torque: Array  # [] N m, the same over the steps in which a force acts
+    torque_peak: Array  # [] N m, of one axis
+    power: Array  # [] W, mean of the sum of |torque x speed| over the axes
+    displacement: Array  # [] rad, norm of log u over the joints
+    root_displacement: Array  # [] m, of u
+
+
+def no_metrics() -> Metrics:
+    """Of an environment that was just reset."""
+    return Metrics(*[jnp.zeros(()) for _ in Metrics.__dataclass_fields__])
+
+
+@flax.struct.dataclass
+class Sums:
+    """Carried through the physics steps of a control step."""
+
+    force_peak: Array  # [] N
+    impulse: Array  # [] N s
+    contact_steps: Array  # []
+    torque_square: Array  # [] N^2 m^2, sum over steps of the mean over axes
+    contact_torque_square: Array  # [] the same over steps in which a force acts
+    torque_peak: Array  # [] N m
+    power: Array  # [] W, sum over steps
+
+
+def no_sums() -> Sums:
+    """Before the first physics step."""
+    return Sums(*[jnp.zeros(()) for _ in Sums.__dataclass_fields__])
+
+
+def add(sums: Sums, force: Array, torque: Array, speed: Array, h: float) -> Sums:
+    """The sums after one more physics step.
+
+    Args:
+        sums: before it.
+        force: that the compliance hears [F, 3], N.
+        torque: of the joints' axes [36], N m.
+        speed: of the same axes [36], rad/s.
+        h: physics step, s.
+    """
+    acts = acting(force)
+    size = jnp.where(acts, jnp.sqrt(jnp.sum(jnp.square(force)) + 1e-12), 0.0)
+    square = jnp.mean(jnp.square(torque))
+    return Sums(
+        force_peak=jnp.maximum(sums.force_peak, size),
+        impulse=sums.impulse + h * size,
+        contact_steps=sums.contact_steps + acts,
+        torque_square=sums.torque_square + square,
+        contact_torque_square=sums.contact_torque_square + acts * square,
+        torque_peak=jnp.maximum(sums.torque_peak, jnp.max(jnp.abs(torque))),
+        power=sums.power + jnp.sum(jnp.abs(torque * speed)),
+    )
+
+
+def metrics(sums: Sums, steps: int, coords: quat.Coordinates, u: Array) -> Metrics:
+    """Of a control step of so many physics steps that ends with displacement u [55]."""
+    contact = jnp.maximum(sums.contact_steps, 1.0)
+    log_u = quat.log_map(coords, u)
+    return Metrics(
+        force_peak=sums.force_peak,
+        impulse=sums.impulse,
+        contact_share=sums.contact_steps / steps,
+        torque_rms=jnp.sqrt(sums.torque_square / steps),
+        contact_torque=jnp.sqrt(sums.contact_torque_square / contact),
+        torque_peak=sums.torque_peak,
+        power=sums.power / steps,
+        displacement=jnp.sqrt(jnp.sum(jnp.square(log_u[6:])) + 1e-12),
+        root_displacement=jnp.sqrt(jnp.sum(jnp.square(log_u[:3])) + 1e-12),
+    )
