@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from toy import Toy
-from toy_run import toy_config
+from toy_run import INTERVAL, toy_config
 
 from dcc_jax import checkpoint, logs, training
 
@@ -71,6 +71,8 @@ def test_uninterrupted_run_leaves_everything_to_read(uninterrupted):
         *("ppo/kl", "ppo/clip_fraction", "ppo/skipped", "disc/skipped"),
     }
     assert named <= entries[0].keys()
+    measured = [entry["update"] for entry in entries if "style/frechet" in entry]
+    assert measured == list(range(INTERVAL, UPDATES + 1, INTERVAL))
     assert checkpoint.available(uninterrupted) == [60, 50, 40]
     assert list((uninterrupted / "tensorboard").iterdir())
     checkpoint.load_policy(uninterrupted)

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any
@@ -16,7 +17,7 @@ import numpy as np
 
 from dcc_jax import checkpoint, config, logs, tasks
 from dcc_jax.config import Config
-from dcc_jax.learn import learner
+from dcc_jax.learn import learner, style
 from dcc_jax.learn.rollout import Environment, Policy
 from dcc_jax.learn.state import TrainState, UpdateReport
 
@@ -132,13 +133,14 @@ def _loop(run: Run, progress: logs.Progress, stop: _StopSignal) -> TrainResult:
     train = run.config.train
     state = _first_state(run, progress.say)
     update = _compiled(run, state, progress.say)
+    measure_style = jax.jit(partial(style.of_running, run.environment))
     done, nan_count = int(state.update), int(state.nan_count)
     log = logs.RunLog(run.run_dir, done)
     began, saved = time.perf_counter(), done
     while done * train.tuples_per_update < train.total_tuples and not stop.name:
         before = time.perf_counter()
         state, report = update(state)
-        metrics = {k: float(v) for k, v in jax.device_get(report.metrics).items()}
+        metrics = _floats(report.metrics)
         done += 1
         now = time.perf_counter()
         metrics = {
@@ -147,12 +149,15 @@ def _loop(run: Run, progress: logs.Progress, stop: _StopSignal) -> TrainResult:
             "tuples_per_second": train.tuples_per_update / (now - before),
             "seconds": now - began,
         } | metrics
+        at_checkpoint = done % train.checkpoint_interval == 0
+        if at_checkpoint:
+            metrics |= _floats(measure_style(jax.device_get(state.running)))
         log.write(metrics)
         progress.show(metrics)
         if metrics["nan_count"] > nan_count:
             nan_count = int(metrics["nan_count"])
             _dump(run.run_dir, done, report, progress.say)
-        if done % train.checkpoint_interval == 0:
+        if at_checkpoint:
             _save(run, done, state)
             saved = done
     if saved != done:
@@ -190,6 +195,10 @@ def _save(run: Run, done: int, state: TrainState) -> None:
     host = jax.device_get(state)
     checkpoint.save(run.run_dir, done, host, run.config.train.keep_checkpoints)
     checkpoint.save_policy(run.run_dir, _policy(host))
+
+
+def _floats(metrics: dict[str, jax.Array]) -> dict[str, float]:
+    return {name: float(value) for name, value in jax.device_get(metrics).items()}
 
 
 def _policy(state: TrainState) -> Policy:

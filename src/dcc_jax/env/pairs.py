@@ -17,9 +17,9 @@ VELOCITY_TIME = 0.1  # s; a body faster by 1 m/s is 0.1 m away
 def pair_coordinates(s: Array, s_next: Array, dt: float) -> Array:
     """A pair of `body_features` as a point [..., 225] in m; Euclidean distances count.
 
-    A body contributes its position, its two columns times `COLUMN_ARM`, and its velocity
-    in s' and in s times `VELOCITY_TIME`. All is divided by the root of the number of
-    bodies: the distance of two points is a root mean square over the bodies.
+    A body contributes its position, its two columns times `COLUMN_ARM`, and its
+    velocity in s' and in s times `VELOCITY_TIME`. All is divided by the root of the
+    number of bodies: the distance of two points is a root mean square over the bodies.
 
     Args:
         s: [..., 270].

@@ -18,11 +18,13 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from dcc_jax.learn.rollout import Environment
+from dcc_jax.learn.rollout import Environment, Running
 
 Array = jax.Array
 
-CLIP_PAIRS = 2048  # M; twice as many change `nearest` of a clip's own pairs by 0.5 mm
+CLIP_PAIRS = (
+    2048  # M; other pairs of the same clips are then 4 to 5 mm from the nearest
+)
 _SEED = 20220707  # of the pairs, the same in every run, so that runs can be compared
 
 
@@ -73,6 +75,18 @@ def frechet(reference: Reference, points: Array, weight: Array) -> Array:
     cross = jnp.sum(jnp.sqrt(jnp.maximum(values, 0.0)))
     spread = jnp.sum(reference.root**2) + jnp.trace(covariance) - 2.0 * cross
     return jnp.sqrt(jnp.sum((mean - reference.mean) ** 2) + jnp.maximum(spread, 0.0))
+
+
+def of_running(environment: Environment, running: Running) -> dict[str, Array]:
+    """`measure` of the pairs that the environments of a rollout hold now, [B].
+
+    Those that were just reset hold none. It depends on the arguments alone, so that a
+    resumed run logs what an uninterrupted one does.
+    """
+    env = running.env
+    points = environment.style_coordinates(env.previous_features, env.features)
+    weight = (running.steps > 0).astype(points.dtype)
+    return measure(make_reference(environment), points, weight)
 
 
 def measure(reference: Reference, points: Array, weight: Array) -> dict[str, Array]:
