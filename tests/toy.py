@@ -27,6 +27,7 @@ class ToyState:
     features: Array  # [2] position
     previous_features: Array  # [2]
     condition: Array  # [0]
+    r_q: Array
     r_p: Array
     r_task: Array
     terminated: Array
@@ -51,6 +52,7 @@ class Toy:
     feature_size: int = 2
     condition_size: int = 0
     has_task_reward: bool = False
+    tracks: bool = False
 
     def reset(self, key: Array, alpha: Array | None = None) -> ToyState:
         position = jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0)
@@ -84,6 +86,7 @@ class Toy:
             features=position,
             previous_features=before,
             condition=jnp.zeros(0),
+            r_q=jnp.zeros(()),
             r_p=jnp.exp(-2.0 * distance),
             r_task=jnp.zeros(()),
             terminated=jnp.max(jnp.abs(position)) > self.wall,

@@ -55,7 +55,10 @@ class EnvConfig:
     """With it alpha is drawn from [alpha, alpha_max] in every episode and observed."""
 
     episode_seconds: float = 10.0
-    """Episodes are truncated then."""
+    """Episodes are truncated then, and where a clip that is followed in time ends."""
+
+    random_start: bool = True
+    """Episodes begin anywhere in a clip (Sec. 5.1); without, at its start."""
 
     mass: float = 65.0
     """Of the character, kg; gains scale with it (Sec. 5.1, 5.3)."""
@@ -107,6 +110,7 @@ class EnvState:
     features: Array  # [270] s' of the discriminator
     previous_features: Array  # [270] s
     condition: Array  # [0]
+    r_q: Array  # [] where the clip is followed in time, else 0
     r_p: Array  # []
     r_task: Array  # []
     terminated: Array  # [] bool
@@ -118,6 +122,7 @@ class EnvState:
     u_previous: Array  # [55] one control step ago
     q_previous: Array  # [55] the character's coordinates then
     start: RootTarget  # of the reference, at the reset
+    reference: RefState  # now, where the clip is followed in time; else at the reset
     alpha: Array  # []
     time: Array  # [] s since the reset
     task: Any
@@ -168,10 +173,13 @@ class Environment:
         )
 
     action_size = property(lambda self: 36 + self.task.extra_actions)
-    observation_size = property(lambda self: 270 + 36 + 4 + 1 + self.task.state_size)
+    observation_size = property(
+        lambda self: 270 + 36 + 4 + 1 + self.task.tracks + self.task.state_size
+    )
     feature_size = property(lambda self: 270)
     condition_size = property(lambda self: 0)
     has_task_reward = property(lambda self: self.task.has_reward)
+    tracks = property(lambda self: self.task.tracks)
     control_dt = 1.0 / CONTROL_RATE
 
     def reset(self, key: Array, alpha: Array | None = None) -> EnvState:
@@ -182,9 +190,8 @@ class Environment:
             alpha: level of compliance; None draws what the configuration says.
         """
         reference_key, task_key, alpha_key = jax.random.split(key, 3)
-        reference = self.references.sample(reference_key)
-        reference = _at_origin(reference)
-        task, qpos, qvel = self.task.reset(task_key, self.scene, reference)
+        reference, start = self._drawn(reference_key)
+        task, qpos, qvel = self.task.reset(task_key, self.scene, start)
         body = physics.initial_state(self.scene, qpos, qvel)
         displacement = compliance.at_rest(self.kinematics.coords)
         zero = jnp.zeros(())
@@ -193,6 +200,7 @@ class Environment:
             features=jnp.zeros(self.feature_size),
             previous_features=jnp.zeros(self.feature_size),
             condition=jnp.zeros(0),
+            r_q=zero,
             r_p=zero,
             r_task=zero,
             terminated=jnp.zeros((), bool),
@@ -202,8 +210,9 @@ class Environment:
             body=body,
             displacement=displacement,
             u_previous=displacement.u,
-            q_previous=reference.qpos_previous,
-            start=RootTarget(reference.qpos[:2], reference.travel),
+            q_previous=start.qpos_previous,
+            start=RootTarget(start.qpos[:2], start.travel),
+            reference=reference,
             alpha=self._alpha(alpha_key) if alpha is None else jnp.asarray(alpha),
             time=zero,
             task=task,
@@ -216,8 +225,9 @@ class Environment:
         Args:
             key: consumed; what the surroundings draw.
             state: of this environment.
-            action: rotation vectors of the 12 joints from the nominal pose [36], rad,
-                then the task's extra actions.
+            action: rotation vectors of the 12 joints [36], rad, from the clip's pose
+                where it is followed in time, else from the nominal pose; then the
+                task's extra actions.
         """
         return self._step(key, state, action, record=False)[0]
 
@@ -231,10 +241,12 @@ class Environment:
         self, key: Array, state: EnvState, action: Array, record: bool
     ) -> tuple[EnvState, Any]:
         def substep(carry: _Substep, _: None) -> tuple[_Substep, Forces | None]:
-            carry, forces = self._substep(carry, action, state.alpha)
+            carry, forces = self._substep(carry, action, pose, state.alpha)
             return carry, forces if record else None
 
         task, body = self.task.control_step(key, self.scene, state.task, state.body)
+        reference = self._following(state.reference)
+        pose = self._target_pose(reference, action)
         start = _Substep(body, state.displacement, task, state.time, metrics.no_sums())
         steps = self.config.control_steps
         end, forces = jax.lax.scan(substep, start, None, length=steps)
@@ -243,6 +255,7 @@ class Environment:
             displacement=end.displacement,
             task=end.task,
             time=end.time,
+            reference=reference,
             q_previous=self.scene.character_qpos(state.body.qpos),
             u_previous=state.displacement.u,
             previous_features=state.features,
@@ -267,6 +280,25 @@ class Environment:
         """Pairs of features [..., 270] as points [..., 225] in m (`learn.style`)."""
         return pairs.pair_coordinates(s, s_next, self.control_dt)
 
+    def _drawn(self, key: Array) -> tuple[RefState, RefState]:
+        """The moment of the reference an episode begins at, and the start beside it."""
+        clip_key, place_key = jax.random.split(key)
+        begin = not self.config.random_start
+        reference = self.references.sample(clip_key, begin=begin)
+        if not self.task.tracks:
+            reference = _at_origin(reference)
+            return reference, reference
+        radius = self.task.start_radius
+        away = jax.random.uniform(place_key, (2,), minval=-radius, maxval=radius)
+        return reference, _moved(reference, away)
+
+    def _following(self, reference: RefState) -> RefState:
+        """The reference a control step later, where it is followed in time."""
+        if not self.task.tracks:
+            return reference
+        time = reference.time + self.control_dt
+        return self.references.state_at(reference.clip, time)
+
     def _features(self, q: Array, q_previous: Array) -> Array:
         return features.body_features(self.kinematics, q, q_previous)
 
@@ -277,12 +309,12 @@ class Environment:
         return jax.random.uniform(key, minval=low, maxval=high)
 
     def _substep(
-        self, carry: _Substep, action: Array, alpha: Array
+        self, carry: _Substep, action: Array, pose: Array, alpha: Array
     ) -> tuple[_Substep, Forces]:
         scene, task = self.scene, self.task
         world = task.world(scene, carry.task, carry.time)
         kin = physics.kinematics(scene, carry.body, world)
-        tau = self._torque(carry, action)
+        tau = self._torque(carry, pose)
         qfrc = scene.scatter_character(tau)
         qfrc = qfrc + task.applied(scene, carry.task, kin, carry.time)
         solution = physics.solve(scene, kin, carry.body, qfrc)
@@ -308,11 +340,17 @@ class Environment:
         implicit = jnp.asarray(self.scene.spd_diagonal, qacc.dtype) * qacc
         return (tau - self.scene.character_qvel(implicit))[6:]
 
-    def _torque(self, carry: _Substep, action: Array) -> Array:
-        target = quat.oplus(self.kinematics.coords, self.nominal, self._offset(action))
+    def _target_pose(self, reference: RefState, action: Array) -> Array:
+        """What the policy asks for [55]: a (+) from the clip's pose or the nominal."""
+        pose = reference.qpos if self.task.tracks else self.nominal
+        tangent = jnp.concatenate([jnp.zeros(6, action.dtype), action[:36]])
+        coords = self.kinematics.coords
+        return quat.oplus(coords, pose, quat.exp_map(coords, tangent))
+
+    def _torque(self, carry: _Substep, target: Array) -> Array:
+        scene = self.scene
         if self.config.displace_target:
             target = quat.oplus(self.kinematics.coords, target, carry.displacement.u)
-        scene = self.scene
         return pd.torque(
             scene.character,
             scene.character_qpos(carry.body.qpos),
@@ -320,10 +358,6 @@ class Environment:
             target,
             scene.timestep,
         )
-
-    def _offset(self, action: Array) -> Array:
-        tangent = jnp.concatenate([jnp.zeros(6, action.dtype), action[:36]])
-        return quat.exp_map(self.kinematics.coords, tangent)
 
     def _displaced(
         self, carry: _Substep, kin: physics.Kinematics, forces: Forces, alpha: Array
@@ -373,6 +407,7 @@ class Environment:
                 _seen_from(q, offset),
                 _seen_from(q, target.velocity),
                 state.alpha[None],
+                self._phase(state),
                 self.task.observe(self.scene, state.task, state.body),
             ]
         )
@@ -384,7 +419,16 @@ class Environment:
             previous_features=jnp.where(first, body_features, state.previous_features),
         )
 
+    def _phase(self, state: EnvState) -> Array:
+        """The clip's phase [1] where it is followed in time, else [0]."""
+        if not self.task.tracks:
+            return jnp.zeros(0)
+        at = state.reference
+        return self.references.phase_at(at.clip, at.time)[None]
+
     def _root_target(self, state: EnvState) -> RootTarget:
+        if self.task.tracks:
+            return RootTarget(state.reference.qpos[:2], state.reference.qvel[:2])
         return self.task.root_target(self.scene, state.task, state.start, state.time)
 
     def _judged(self, state: EnvState) -> EnvState:
@@ -407,11 +451,31 @@ class Environment:
         )
         failed = self.task.terminated(scene, state.task, state.body)
         return state.replace(
+            r_q=self._tracking(state, q),
             r_p=r_p,
             r_task=self.task.reward(scene, state.task, state.body),
             terminated=fallen | failed,
-            truncated=state.time >= config.episode_seconds - 1e-4,
+            truncated=self._over(state),
         )
+
+    def _tracking(self, state: EnvState, q: Array) -> Array:
+        """How well q (-) u follows the clip in time, where it does."""
+        if not self.task.tracks:
+            return jnp.zeros(())
+        coords = self.kinematics.coords
+        _, here = coords.split_q(quat.ominus(coords, q, state.displacement.u))
+        _, there = coords.split_q(state.reference.qpos)
+        error = quat.log(quat.mul(quat.inv(there), here))
+        return rewards.tracking_reward(error, self.config.reward)
+
+    def _over(self, state: EnvState) -> Array:
+        """Whether the time is up, or the clip that is followed at its end."""
+        late = state.time >= self.config.episode_seconds - 1e-4
+        if not self.task.tracks:
+            return late
+        at = state.reference
+        ended = at.time >= self.references.duration[at.clip] - 1e-4
+        return late | (ended & ~self.references.loop[at.clip])
 
 
 def _nominal_pose(references: References) -> Array:
@@ -431,9 +495,14 @@ def _nominal_pose(references: References) -> Array:
 
 def _at_origin(reference: RefState) -> RefState:
     """The same moment with the root over the world's origin."""
-    shift = reference.qpos * jnp.zeros(55).at[:2].set(1.0)
+    return _moved(reference, -reference.qpos[:2])
+
+
+def _moved(reference: RefState, away: Array) -> RefState:
+    """The same moment, elsewhere by [2] m over the ground."""
+    shift = jnp.zeros(55).at[:2].set(away)
     return reference.replace(
-        qpos=reference.qpos - shift, qpos_previous=reference.qpos_previous - shift
+        qpos=reference.qpos + shift, qpos_previous=reference.qpos_previous + shift
     )
 
 

@@ -14,6 +14,7 @@ policy sees log u of the 12 joints (36) on top, the paper's 306.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +22,7 @@ import mujoco
 import numpy as np
 
 from dcc_jax import quat
+from dcc_jax.character import BODIES, compose_scene, load_character
 
 Array = jax.Array
 
@@ -118,6 +120,19 @@ def body_poses(kinematics: Kinematics, q: Array) -> tuple[Array, Array]:
     bones = quat.rotate(quat_w[kinematics.parents], offset)
     ancestors = jnp.asarray(kinematics.ancestors, q.dtype)
     return q[:3] + jnp.matmul(ancestors, bones, precision="highest"), quat_w
+
+
+@cache
+def skeleton() -> Kinematics:
+    """The tree of our character; its segments do not depend on its mass."""
+    return Kinematics.of(compose_scene(load_character(), floor=False))
+
+
+def body_pose(q: Array, name: str) -> tuple[Array, Array]:
+    """World position [3] and orientation [4] of one body, by name, at q [55]."""
+    pos_w, quat_w = body_poses(skeleton(), q)
+    body = BODIES.index(name)
+    return pos_w[body], quat_w[body]
 
 
 def _compose(a: Array, b: Array) -> Array:

@@ -33,6 +33,8 @@ class RewardConfig:
     """Sharpness in position, 1/m^2, Eq. (14)."""
     sigma_v: float = 1.0
     """Sharpness in velocity, s^2/m^2, Eq. (14)."""
+    sigma_q: float = 2.0
+    """Sharpness of the tracking reward, 1/rad^2 (Peng et al. 2018)."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -52,6 +54,18 @@ def pose_reward(d: Array, config: RewardConfig) -> Array:
         config: beta.
     """
     return jnp.maximum(0.0, 1.0 - config.beta * jnp.square(d - 1.0))
+
+
+def tracking_reward(error: Array, config: RewardConfig) -> Array:
+    """r_q = exp(-sigma_q sum |log(q_m^-1 q)|^2), the pose term of Peng et al. 2018.
+
+    It takes the place of `pose_reward` where q_m(t) is known, as in the Appendix.
+
+    Args:
+        error: rotation vectors from the reference to the pose [..., J, 3], rad.
+        config: its sharpness.
+    """
+    return jnp.exp(-config.sigma_q * jnp.sum(jnp.square(error), axis=(-2, -1)))
 
 
 def position_reward(

@@ -52,6 +52,12 @@ class Task:
     clips: ClassVar[tuple[str, ...]] = ("stand",)
     """Assets in `assets/motions` that a fresh install trains on."""
     has_reward: ClassVar[bool] = False
+    tracks: ClassVar[bool] = False
+    """Whether the clip is followed in time (Sec. 5.4 and Appendix): its phase is
+    observed, actions are offsets from its pose, a tracking reward replaces the
+    discriminator's, and the world is the one the clip was made in."""
+    start_radius: ClassVar[float] = 0.0
+    """m in x and y, how far beside such a clip an episode may begin."""
     extra_actions: ClassVar[int] = 0
     state_size: ClassVar[int] = 0
     clock: ClassVar[str | None] = None

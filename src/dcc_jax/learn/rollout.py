@@ -29,6 +29,8 @@ class EnvState(Protocol):
     @property
     def condition(self) -> Array: ...  # [C]
     @property
+    def r_q(self) -> Array: ...  # [] read where the environment tracks
+    @property
     def r_p(self) -> Array: ...  # []
     @property
     def r_task(self) -> Array: ...  # []
@@ -56,6 +58,8 @@ class Environment(Protocol):
     def condition_size(self) -> Any: ...
     @property
     def has_task_reward(self) -> Any: ...
+    @property
+    def tracks(self) -> Any: ...  # whether r_q is its own, not the discriminator's
 
     def reset(self, key: Array, alpha: Array | None = None) -> Any: ...
     def step(self, key: Array, state: Any, action: Array) -> Any: ...
@@ -102,6 +106,7 @@ class Transition:
     action: Array  # [T, B, A] rad
     log_prob: Array  # [T, B]
     pairs: Pairs  # [T, B, ...] body features before and after
+    r_q: Array  # [T, B] read where the environment tracks
     r_p: Array  # [T, B]
     r_task: Array  # [T, B]
     terminated: Array  # [T, B] bool
@@ -236,6 +241,7 @@ def _transition(
         pairs=Pairs(
             s=env.previous_features, s_next=env.features, condition=env.condition
         ),
+        r_q=env.r_q,
         r_p=env.r_p,
         r_task=env.r_task,
         terminated=env.terminated,

@@ -129,8 +129,11 @@ def _rewards(
 ) -> tuple[Array, dict[str, Array]]:
     """Eq. 10, 11 and 13: the reward [T, B], and the means of its parts."""
     weights = config.env.reward
-    x = discriminator.inputs(state.feature_normalizer, transitions.pairs)
-    r_q = rewards.pose_reward(discriminator.score(params, x), weights)
+    if environment.tracks:
+        r_q = transitions.r_q
+    else:
+        x = discriminator.inputs(state.feature_normalizer, transitions.pairs)
+        r_q = rewards.pose_reward(discriminator.score(params, x), weights)
     r_task = transitions.r_task if environment.has_task_reward else None
     total = rewards.reward(r_q, transitions.r_p, weights, r_task)
     return total, {

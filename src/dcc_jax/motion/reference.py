@@ -103,7 +103,12 @@ class References:
         )
 
     def sample(
-        self, key: Array, *, heading: bool = False, radius: float = 0.0
+        self,
+        key: Array,
+        *,
+        heading: bool = False,
+        radius: float = 0.0,
+        begin: bool = False,
     ) -> RefState:
         """Reference State Initialization: a moment drawn from the clips.
 
@@ -113,12 +118,13 @@ class References:
             key: random key, consumed.
             heading: turn the character about the vertical by a random angle.
             radius: move it by up to this far in x and in y, m.
+            begin: take the first such moment of the clip instead of drawing one.
         """
         clip_key, time_key, turn_key, shift_key = jax.random.split(key, 4)
         clip = self._draw(clip_key, ())
-        begin = jnp.where(self.loop[clip], 0.0, self.control_dt)
-        share = jax.random.uniform(time_key)
-        state = self.state_at(clip, begin + share * (self.duration[clip] - begin))
+        first = jnp.where(self.loop[clip], 0.0, self.control_dt)
+        share = 0.0 if begin else jax.random.uniform(time_key)
+        state = self.state_at(clip, first + share * (self.duration[clip] - first))
         if not heading and radius == 0.0:
             return state
         turn = jax.random.uniform(turn_key, minval=-jnp.pi, maxval=jnp.pi) * heading
