@@ -31,6 +31,7 @@ from dcc_jax.motion.reference import References, RefState
 Array = jax.Array
 
 CONTROL_RATE = 30  # Hz, Sec. 5.1
+ALPHA_ENTRY = 270 + 36 + 4  # of the observation, where alpha is
 
 
 @dataclass(frozen=True)

@@ -29,14 +29,18 @@ def make_task(name: str) -> Task:
     return TASKS[name]()
 
 
-def make_environment(config: Config) -> Environment:
+def make_environment(config: Config, task: Task | None = None) -> Environment:
     """The environment that a configuration describes.
+
+    Args:
+        config: of the run.
+        task: in place of the one that it names, e.g. with other parameters.
 
     Raises:
         ValueError: an unknown task.
         MotionError: a clip that cannot be read.
     """
-    task = make_task(config.task)
+    task = make_task(config.task) if task is None else task
     return Environment(
         task,
         load_character(config.env.mass),
