@@ -1,0 +1,264 @@
+"""Hand-in-hand running (Sec. 5.3): a partner pulls the character by its left hand.
+
+The partner is kinematic: nothing can hold it back. Its hand and the character's are
+joined by a ball joint, whose constraint force is fed to the compliance in every physics
+step. The reference's root runs beside the partner.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from functools import cache
+from typing import ClassVar
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from dcc_jax import physics, quat
+from dcc_jax.character import BODIES, compose_scene, load_character
+from dcc_jax.env import features
+from dcc_jax.env.task import Forces, RootTarget, Task, place_character
+from dcc_jax.motion.reference import CONTROL_DT, RefState
+from dcc_jax.tasks import partner
+from dcc_jax.tasks.partner import Gaits, Motion
+
+Array = jax.Array
+
+HAND = "left_hand"
+PALM = (0.0, 0.085, 0.0)  # m, in the hand's frame
+ZERO_PALM = (0.0, 0.775, 1.335)  # m, where it is in the character's zero pose
+NOMINAL_HAND = (0.15, 0.45, 0.9)  # m ahead, left and up of the reference's root
+SETTLING_TIME = 0.2  # s, in which the joined hands leave the reference's arm swing
+CADENCE = 2.0 * np.pi * 2.7  # rad/s, of the steps that rock the partner's hand
+RUN = 3.0  # m/s, at which they rock it in full
+IMPEDANCE = 0.95  # of the joint: 1 would be rigid
+TIME_CONSTANT = 0.02  # s, of the joint
+LEAD = 2.0 * TIME_CONSTANT
+"""s. MuJoCo takes a mocap body for resting: its joint drags on a hand that moves, as
+-b v - k x with b / k = LEAD. Held that far ahead of itself, the partner's hand pulls as
+-b (v - v_partner) - k (x - x_partner) would."""
+
+
+@flax.struct.dataclass
+class State:
+    """The partner, where the hands were joined, and what the joint bore."""
+
+    motion: Motion
+    first_hand: Array  # [3] m, where the hands were at the reset, off NOMINAL_HAND
+    first_drift: Array  # [3] m/s, how fast they moved
+    force_square: Array  # [] N^2 s of the joint, integrated over the control step
+    force_peak: Array  # [] N, its largest force in the control step
+
+
+@dataclass(frozen=True)
+class HandInHand(Task):
+    """Stand, walk, jog and run where the partner goes."""
+
+    name: ClassVar[str] = "hand-in-hand"
+    clips: ClassVar[tuple[str, ...]] = (
+        "stand",
+        "walk",
+        "walk_left",
+        "walk_right",
+        "walk_cycle",
+        "run",
+        "run_cycle",
+    )
+    state_size: ClassVar[int] = 8
+
+    gaits: Gaits = field(default_factory=Gaits)
+    """What the partner does."""
+    bounce: float = 0.03
+    """m, how far the hand rocks up and down in a run; less at lower speed."""
+    longest_gap: float = 0.15
+    """m between the hands; beyond it they have parted."""
+    farthest: float = 1.2
+    """m between the root and the reference's; beyond it the character is dragged."""
+
+    def extend(self, spec: mujoco.MjSpec) -> None:
+        """The partner and the ball joint between the hands."""
+        # MuJoCo joins bodies where they are in the zero pose.
+        body = spec.worldbody.add_body(name="partner", mocap=True, pos=ZERO_PALM)
+        _add_figure(body)
+        joint = spec.add_equality(
+            name="hands",
+            type=mujoco.mjtEq.mjEQ_CONNECT,
+            objtype=mujoco.mjtObj.mjOBJ_BODY,
+            name1=HAND,
+            name2="partner",
+        )
+        joint.data[:3] = PALM
+        joint.solref = [TIME_CONSTANT, 1.0]
+        joint.solimp = [IMPEDANCE, IMPEDANCE, 0.001, 0.5, 2.0]
+
+    def reset(
+        self, key: Array, scene: physics.Scene, reference: RefState
+    ) -> tuple[State, Array, Array]:
+        """The partner goes as the reference does, its hand where the reference's is."""
+        root, before = reference.qpos[:2], reference.qpos_previous[:2]
+        ahead = quat.rotate(quat.heading(reference.qpos[3:7]), jnp.array([1.0, 0, 0]))
+        facing = jnp.arctan2(ahead[1], ahead[0])
+        motion = partner.begin(key, self.gaits, root, reference.qvel[:2], facing)
+        now = partner.to_path(palm(reference.qpos), root, motion.heading)
+        then = partner.to_path(palm(reference.qpos_previous), before, motion.heading)
+        state = State(
+            motion=motion,
+            first_hand=now - jnp.array(NOMINAL_HAND),
+            first_drift=(now - then) / CONTROL_DT,
+            force_square=jnp.zeros(()),
+            force_peak=jnp.zeros(()),
+        )
+        return state, *place_character(scene, reference)
+
+    def control_step(
+        self, key: Array, scene: physics.Scene, state: State, body: physics.State
+    ) -> tuple[State, physics.State]:
+        """The partner goes on."""
+        return dataclasses.replace(
+            state,
+            motion=partner.go_on(key, self.gaits, state.motion),
+            force_square=jnp.zeros(()),
+            force_peak=jnp.zeros(()),
+        ), body
+
+    def hand(self, state: State, time: Array) -> tuple[Array, Array]:
+        """Position [3] m and velocity [3] m/s of the partner's hand, world."""
+
+        def position(time: Array) -> Array:
+            root, heading, speed = partner.path(state.motion, time)
+            rocking = self.bounce * jnp.minimum(speed / RUN, 1.0)
+            offset = jnp.array(NOMINAL_HAND) + _settling(state, time)
+            offset = offset.at[2].add(rocking * jnp.sin(CADENCE * time))
+            return partner.from_path(offset, root, heading)
+
+        time = jnp.asarray(time)
+        return jax.jvp(position, (time,), (jnp.ones_like(time),))
+
+    def world(self, scene: physics.Scene, state: State, time: Array) -> physics.World:
+        """The partner, its hand `LEAD` s ahead."""
+        position, velocity = self.hand(state, time)
+        _, heading, _ = partner.path(state.motion, time)
+        half = 0.5 * heading
+        facing = jnp.stack([jnp.cos(half), 0.0 * half, 0.0 * half, jnp.sin(half)])
+        return dataclasses.replace(
+            physics.default_world(scene),
+            mocap_pos=(position + LEAD * velocity)[None],
+            mocap_quat=facing[None],
+        )
+
+    def root_target(
+        self, scene: physics.Scene, state: State, start: RootTarget, time: Array
+    ) -> RootTarget:
+        """Beside the partner."""
+        position, heading, speed = partner.path(state.motion, time)
+        return RootTarget(position, speed * partner.direction(heading))
+
+    def forces(
+        self,
+        scene: physics.Scene,
+        state: State,
+        kin: physics.Kinematics,
+        solution: physics.Solution,
+        action: Array,
+    ) -> tuple[State, Forces]:
+        """The constraint force on the palm, F = 1."""
+        hand = scene.body(HAND)
+        reach = quat.rotate(kin.body_quat[hand], jnp.array(PALM))
+        force = solution.equality_force[:3]
+        square = jnp.sum(jnp.square(force))
+        state = dataclasses.replace(
+            state,
+            force_square=state.force_square + scene.timestep * square,
+            force_peak=jnp.maximum(state.force_peak, jnp.sqrt(square + 1e-12)),
+        )
+        return state, Forces(
+            force_w=force[None],
+            point_w=(kin.body_pos[hand] + reach)[None],
+            body=jnp.array([hand]),
+            gate=jnp.ones((), bool),
+        )
+
+    def observe(self, scene: physics.Scene, state: State, body: physics.State) -> Array:
+        """The partner's hand, its velocity [6], and cos and sin of the way it goes."""
+        origin, facing = features.local_frame(scene.character_qpos(body.qpos))
+        now = _end(state)
+        position, velocity = self.hand(state, now)
+        _, heading, _ = partner.path(state.motion, now)
+        ahead = jnp.append(partner.direction(heading), 0.0)
+        seen = jnp.stack([position - origin, velocity, ahead])
+        return quat.rotate(quat.inv(facing), seen).reshape(-1)[:8]
+
+    def terminated(
+        self, scene: physics.Scene, state: State, body: physics.State
+    ) -> Array:
+        """The hands have parted, or the character is dragged along."""
+        numbers = self.evaluate(scene, state, body)
+        parted = numbers["hand_gap"] > self.longest_gap
+        return parted | (numbers["path_distance"] > self.farthest)
+
+    def evaluate(
+        self, scene: physics.Scene, state: State, body: physics.State
+    ) -> dict[str, Array]:
+        """Of a control step: mean square (N^2) and peak (N) of the joint's force, gap
+        between the hands and distance to the path (m), speed of the partner (m/s)."""
+        q = scene.character_qpos(body.qpos)
+        root, _, speed = partner.path(state.motion, _end(state))
+        hand, _ = self.hand(state, _end(state))
+        return {
+            "hand_force_square": state.force_square / CONTROL_DT,
+            "hand_force_peak": state.force_peak,
+            "hand_gap": _length(palm(q) - hand),
+            "path_distance": _length(q[:2] - root),
+            "partner_speed": speed,
+        }
+
+
+def palm(q: Array) -> Array:
+    """Where the left palm of a character with coordinates [55] is: [3] m, world."""
+    positions, quats = features.body_poses(_kinematics(), q)
+    hand = BODIES.index(HAND)
+    return positions[hand] + quat.rotate(quats[hand], jnp.array(PALM))
+
+
+@cache
+def _kinematics() -> features.Kinematics:
+    return features.Kinematics.of(compose_scene(load_character(), floor=False))
+
+
+def _end(state: State) -> Array:
+    """The end of the control step, when it is judged and observed."""
+    return state.motion.time + CONTROL_DT
+
+
+def _settling(state: State, time: Array) -> Array:
+    """What is left of the hands' first offset [3] m: a critically damped return."""
+    rate = 1.0 / SETTLING_TIME
+    push = state.first_drift + rate * state.first_hand
+    return (state.first_hand + time * push) * jnp.exp(-rate * time)
+
+
+def _length(vector: Array) -> Array:
+    return jnp.sqrt(jnp.sum(jnp.square(vector)) + 1e-12)
+
+
+def _add_figure(body: mujoco.MjsBody) -> None:
+    """What is seen of the partner, who goes to the left of the hands."""
+    seen = {"contype": 0, "conaffinity": 0, "rgba": [0.80, 0.50, 0.25, 1.0]}
+    shoulder, hip, side = [-0.1, 0.28, 0.42], [-0.1, 0.45, 0.0], [-0.1, 0.45]
+    for name, start, end, radius in (
+        ("partner_arm", [0.0, 0.0, 0.0], shoulder, 0.045),
+        ("partner_trunk", hip, [*side, 0.4], 0.12),
+        ("partner_leg", hip, [*side, -0.8], 0.08),
+        ("partner_head", [*side, 0.66], [*side, 0.7], 0.105),
+    ):
+        body.add_geom(
+            name=name,
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+            fromto=start + end,
+            size=[radius, 0, 0],
+            **seen,
+        )

@@ -1,0 +1,158 @@
+"""A path to follow: standing, walking, jogging, running, with turns, drawn as it goes.
+
+Within a control step the acceleration and the turning rate are constant, so the motion
+is that of the step's beginning and these two. Everything is pure and of ONE partner.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from dcc_jax.motion.reference import CONTROL_DT
+
+Array = jax.Array
+
+
+SWAY = 0.3
+"""m/s; who is slower sways on the spot, and his velocity points nowhere."""
+
+
+@flax.struct.dataclass
+class Motion:
+    """The partner at `time`, what it does in this control step, and what it wants."""
+
+    time: Array  # [] s since the reset
+    position: Array  # [2] m, world
+    heading: Array  # [] rad, direction of the path
+    speed: Array  # [] m/s
+    acceleration: Array  # [] m/s^2
+    turn: Array  # [] rad/s
+    wanted_speed: Array  # [] m/s
+    wanted_turn: Array  # [] rad/s
+    left: Array  # [] s until it wants something else
+
+
+@dataclass(frozen=True)
+class Gaits:
+    """What a partner does."""
+
+    speeds: tuple[float, ...] = (0.0, 1.2, 2.0, 3.0)
+    """m/s; it stops, walks, jogs or runs."""
+    leg_time: tuple[float, float] = (1.5, 3.5)
+    """s for which it wants the same."""
+    acceleration: float = 1.5
+    """m/s^2, at most: a run begins within two seconds."""
+    turn_rate: float = 0.6
+    """rad/s, at most."""
+    turn_acceleration: float = 1.5
+    """rad/s^2, at most."""
+    sideways: float = 1.5
+    """m/s^2, at most, to the inside of a turn: a run turns less than a walk."""
+
+
+def begin(
+    key: Array, gaits: Gaits, position: Array, velocity: Array, facing: Array
+) -> Motion:
+    """A partner that goes on for a while as the reference does at the reset.
+
+    Args:
+        key: consumed.
+        gaits: what it may do later.
+        position: of the reference's root [2], m, world.
+        velocity: of it [2], m/s. Below `SWAY` it stands, and will go where it faces.
+        facing: heading of the reference, rad.
+    """
+    speed = jnp.sqrt(jnp.sum(jnp.square(velocity)) + 1e-12)
+    goes = speed > SWAY
+    heading = jnp.where(goes, jnp.arctan2(velocity[1], velocity[0]), facing)
+    speed = jnp.where(goes, speed, 0.0)
+    zero = jnp.zeros(())
+    return Motion(
+        # One step back: the first control step then begins at the reset.
+        time=zero - CONTROL_DT,
+        position=position - CONTROL_DT * speed * direction(heading),
+        heading=heading,
+        speed=speed,
+        acceleration=zero,
+        turn=zero,
+        wanted_speed=speed,
+        wanted_turn=zero,
+        left=jax.random.uniform(key, maxval=gaits.leg_time[0]),
+    )
+
+
+def go_on(key: Array, gaits: Gaits, motion: Motion) -> Motion:
+    """One control step later; now and then the partner wants something else."""
+    motion = _wanting(key, gaits, _advanced(motion))
+    reach = gaits.acceleration * CONTROL_DT
+    faster = jnp.clip(motion.wanted_speed - motion.speed, -reach, reach)
+    tightest = gaits.sideways / jnp.maximum(motion.speed, 0.1)
+    # Who stands does not turn.
+    tightest = jnp.minimum(tightest, gaits.turn_rate * motion.speed)
+    wanted_turn = jnp.clip(motion.wanted_turn, -tightest, tightest)
+    reach = gaits.turn_acceleration * CONTROL_DT
+    return dataclasses.replace(
+        motion,
+        acceleration=faster / CONTROL_DT,
+        turn=motion.turn + jnp.clip(wanted_turn - motion.turn, -reach, reach),
+    )
+
+
+def path(motion: Motion, time: Array) -> tuple[Array, Array, Array]:
+    """Position [2], heading [] and speed [] at a moment of the control step."""
+    elapsed = time - motion.time
+    covered = elapsed * (motion.speed + 0.5 * elapsed * motion.acceleration)
+    middle = motion.heading + 0.5 * elapsed * motion.turn
+    return (
+        motion.position + covered * direction(middle),
+        motion.heading + elapsed * motion.turn,
+        motion.speed + elapsed * motion.acceleration,
+    )
+
+
+def direction(heading: Array) -> Array:
+    """The unit vector [2] of a heading in rad."""
+    return jnp.stack([jnp.cos(heading), jnp.sin(heading)])
+
+
+def to_path(point: Array, root: Array, heading: Array) -> Array:
+    """A point [3] of the world seen from a point [2] of the path: ahead, left, up."""
+    along = direction(heading)
+    offset = point[:2] - root
+    across = along[0] * offset[1] - along[1] * offset[0]
+    return jnp.stack([along @ offset, across, point[2]])
+
+
+def from_path(offset: Array, root: Array, heading: Array) -> Array:
+    """The inverse of `to_path`."""
+    along = direction(heading)
+    across = jnp.stack([-along[1], along[0]])
+    return jnp.append(root + offset[0] * along + offset[1] * across, offset[2])
+
+
+def _advanced(motion: Motion) -> Motion:
+    now = motion.time + CONTROL_DT
+    position, heading, speed = path(motion, now)
+    return dataclasses.replace(
+        motion, time=now, position=position, heading=heading, speed=speed
+    )
+
+
+def _wanting(key: Array, gaits: Gaits, motion: Motion) -> Motion:
+    speed_key, turn_key, time_key = jax.random.split(key, 3)
+    due = motion.left <= 0.0
+    speed = jax.random.choice(speed_key, jnp.array(gaits.speeds))
+    turn = jax.random.uniform(turn_key, minval=-gaits.turn_rate, maxval=gaits.turn_rate)
+    shortest, longest = gaits.leg_time
+    left = jax.random.uniform(time_key, minval=shortest, maxval=longest)
+    return dataclasses.replace(
+        motion,
+        wanted_speed=jnp.where(due, speed, motion.wanted_speed),
+        wanted_turn=jnp.where(due, turn, motion.wanted_turn),
+        left=jnp.where(due, left, motion.left - CONTROL_DT),
+    )
