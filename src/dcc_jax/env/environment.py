@@ -130,7 +130,17 @@ class EnvState:
 
 
 @flax.struct.dataclass
-class _Substep:
+class Plan:
+    """What stays the same in the physics steps of one control step."""
+
+    action: Array  # [A]
+    pose: Array  # [55] that the policy asks for
+    alpha: Array  # []
+    reference: RefState  # at the end of the control step
+
+
+@flax.struct.dataclass
+class Substep:
     """Carried through the physics steps of one control step."""
 
     body: physics.State
@@ -241,31 +251,42 @@ class Environment:
     def _step(
         self, key: Array, state: EnvState, action: Array, record: bool
     ) -> tuple[EnvState, Any]:
-        def substep(carry: _Substep, _: None) -> tuple[_Substep, Forces | None]:
-            carry, forces = self._substep(carry, action, pose, state.alpha)
+        def substep(carry: Substep, _: None) -> tuple[Substep, Forces | None]:
+            carry, forces = self._substep(carry, plan)
             return carry, forces if record else None
 
+        start, plan = self.begin(key, state, action)
+        steps = self.config.control_steps
+        end, forces = jax.lax.scan(substep, start, None, length=steps)
+        return self.end(state, plan, end), forces
+
+    def begin(self, key: Array, state: EnvState, action: Array) -> tuple[Substep, Plan]:
+        """The beginning of a control step."""
         task, body = self.task.control_step(key, self.scene, state.task, state.body)
         reference = self._following(state.reference)
         pose = self._target_pose(reference, action)
-        start = _Substep(body, state.displacement, task, state.time, metrics.no_sums())
-        steps = self.config.control_steps
-        end, forces = jax.lax.scan(substep, start, None, length=steps)
+        start = Substep(body, state.displacement, task, state.time, metrics.no_sums())
+        return start, Plan(action, pose, state.alpha, reference)
+
+    def end(self, state: EnvState, plan: Plan, end: Substep) -> EnvState:
+        """The state after a control step, by that before it and its last substep."""
         new = state.replace(
             body=end.body,
             displacement=end.displacement,
             task=end.task,
             time=end.time,
-            reference=reference,
+            reference=plan.reference,
             q_previous=self.scene.character_qpos(state.body.qpos),
             u_previous=state.displacement.u,
             previous_features=state.features,
             metrics=metrics.metrics(
-                end.sums, steps, self.kinematics.coords, end.displacement.u
+                end.sums,
+                self.config.control_steps,
+                self.kinematics.coords,
+                end.displacement.u,
             ),
         )
-        new = self._judged(self._observed(new))
-        return _contained(new, state), forces
+        return _contained(self._judged(self._observed(new)), state)
 
     def expert_pairs(self, key: Array, n: int) -> tuple[Array, Array, Array]:
         """(s, s') ~ M: features [n, 270] twice, and the condition [n, 0]."""
@@ -309,18 +330,36 @@ class Environment:
             return jnp.asarray(low)
         return jax.random.uniform(key, minval=low, maxval=high)
 
-    def _substep(
-        self, carry: _Substep, action: Array, pose: Array, alpha: Array
-    ) -> tuple[_Substep, Forces]:
+    def _substep(self, carry: Substep, plan: Plan) -> tuple[Substep, Forces]:
         scene, task = self.scene, self.task
         world = task.world(scene, carry.task, carry.time)
         kin = physics.kinematics(scene, carry.body, world)
-        tau = self._torque(carry, pose)
+        tau = self.torque(carry, plan)
         qfrc = scene.scatter_character(tau)
         qfrc = qfrc + task.applied(scene, carry.task, kin, carry.time)
         solution = physics.solve(scene, kin, carry.body, qfrc)
-        task_state, forces = task.forces(scene, carry.task, kin, solution, action)
-        displacement = self._displaced(carry, kin, forces, alpha)
+        return self.react(carry, plan, kin, tau, solution)
+
+    def react(
+        self,
+        carry: Substep,
+        plan: Plan,
+        kin: physics.Kinematics,
+        tau: Array,
+        solution: physics.Solution,
+    ) -> tuple[Substep, Forces]:
+        """A physics step later: what the solution does to body and displacement.
+
+        Args:
+            carry: at the beginning of the physics step.
+            plan: of the control step.
+            kin: at the beginning of the physics step.
+            tau: torques applied to the character [42], from `torque`.
+            solution: accelerations and forces under them.
+        """
+        scene, task = self.scene, self.task
+        task_state, forces = task.forces(scene, carry.task, kin, solution, plan.action)
+        displacement = self._displaced(carry, kin, forces, plan.alpha)
         sums = metrics.add(
             carry.sums,
             jnp.where(forces.gate, forces.force_w, 0.0),
@@ -328,7 +367,7 @@ class Environment:
             scene.character_qvel(carry.body.qvel)[6:],
             scene.timestep,
         )
-        return _Substep(
+        return Substep(
             body=physics.integrate(scene, carry.body, solution),
             displacement=displacement,
             task=task_state,
@@ -348,8 +387,9 @@ class Environment:
         coords = self.kinematics.coords
         return quat.oplus(coords, pose, quat.exp_map(coords, tangent))
 
-    def _torque(self, carry: _Substep, target: Array) -> Array:
-        scene = self.scene
+    def torque(self, carry: Substep, plan: Plan) -> Array:
+        """Stable PD torques [42], N m, towards the pose asked for (+) u."""
+        scene, target = self.scene, plan.pose
         if self.config.displace_target:
             target = quat.oplus(self.kinematics.coords, target, carry.displacement.u)
         return pd.torque(
@@ -361,7 +401,7 @@ class Environment:
         )
 
     def _displaced(
-        self, carry: _Substep, kin: physics.Kinematics, forces: Forces, alpha: Array
+        self, carry: Substep, kin: physics.Kinematics, forces: Forces, alpha: Array
     ) -> Displacement:
         """Alg. 1 for one physics step."""
         scene, config = self.scene, self.config.compliance
