@@ -19,6 +19,7 @@ LEVELS = {
     "draw": 0,  # pictures from plain arrays; the motion commands show clips with it
     "draw_plain": 0,
     "logs": 0,
+    "command": 0,
     "character": 1,
     "solver": 1,
     "physics": 2,

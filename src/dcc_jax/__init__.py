@@ -14,14 +14,16 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from dcc_jax.config import make_config
     from dcc_jax.control.stiffness import stiffness
+    from dcc_jax.evaluate import evaluate
     from dcc_jax.sweep import sweep
     from dcc_jax.train import train
 
-__all__ = ["make_config", "stiffness", "sweep", "train"]
+__all__ = ["evaluate", "make_config", "stiffness", "sweep", "train"]
 
 _HOMES = {
     "make_config": "config",
     "train": "train",
+    "evaluate": "evaluate",
     "sweep": "sweep",
     "stiffness": "control.stiffness",
 }

@@ -217,7 +217,7 @@ def log_map(coords: Coordinates, u: Array) -> Array:
     return coords.join_v(scalars, log(quats))
 
 
-def integrate(coords: Coordinates, q: Array, v: Array, dt: float) -> Array:
+def integrate(coords: Coordinates, q: Array, v: Array, dt: Array | float) -> Array:
     """q after moving with the velocity v [..., nv] for dt seconds, renormalized."""
     q_scalars, q_quats = coords.split_q(q)
     v_scalars, v_tangents = coords.split_v(v)

@@ -7,19 +7,20 @@ The loop itself is in `dcc_jax.training`. This file imports nothing heavy before
 from __future__ import annotations
 
 import contextlib
-import os
 import sys
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dcc_jax import runtime
+from dcc_jax import command, runtime
 
 if TYPE_CHECKING:
     from dcc_jax.config import Config
     from dcc_jax.learn.rollout import Environment
     from dcc_jax.training import TrainResult
+
+PROGRAM = "dcc_jax.train"
 
 
 def train(
@@ -49,35 +50,25 @@ def main(argv: Sequence[str] | None = None) -> int:
         run = training.prepare(said.config, said.run_dir, said.resume)
     # OSError: a run directory that cannot be made, a clip that cannot be opened.
     except (ValueError, OSError) as error:
-        return _complain(str(error), 2)
+        return command.complain(PROGRAM, str(error), 2)
     try:
         training.execute(run)
     except training.RunError as error:
-        return _complain(str(error), 1)
+        return command.complain(PROGRAM, str(error), 1)
     except KeyboardInterrupt:
-        return _complain("interrupted twice; what was not saved is lost", 1)
+        return command.complain(
+            PROGRAM, "interrupted twice; what was not saved is lost", 1
+        )
     except Exception as error:
         log = run.run_dir / "error.log"
         with contextlib.suppress(OSError):
             log.write_text(traceback.format_exc())
         reason = (str(error).splitlines() or [""])[0][:200]
-        return _complain(f"{type(error).__name__}: {reason} (details in {log})", 1)
+        return command.complain(
+            PROGRAM, f"{type(error).__name__}: {reason} (details in {log})", 1
+        )
     return 0
 
 
-def _complain(problem: str, status: int) -> int:
-    with contextlib.suppress(OSError):
-        print(f"dcc_jax.train: {' '.join(problem.split())}", file=sys.stderr)
-    return status
-
-
-def _leave(status: int) -> None:
-    """Ends the process at once: XLA's threads can hold up an ordinary exit."""
-    for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(OSError):
-            stream.flush()
-    os._exit(status)
-
-
 if __name__ == "__main__":
-    _leave(main())
+    command.leave(main())

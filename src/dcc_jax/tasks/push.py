@@ -45,6 +45,7 @@ class Push(Task):
         *(f"recover_{angle:03d}" for angle in range(0, 360, 45)),
     )
     state_size: ClassVar[int] = 6
+    clock: ClassVar[str | None] = "since_throw"
 
     interval: float = 1.5
     """s between two throws."""
@@ -137,6 +138,15 @@ class Push(Task):
     def observe(self, scene: physics.Scene, state: State, body: physics.State) -> Array:
         """Nothing of the ball: a push is felt, not seen. Root velocity, [6]."""
         return scene.character_qvel(body.qvel)[:6]
+
+    def evaluate(
+        self, scene: physics.Scene, state: State, body: physics.State
+    ) -> dict[str, Array]:
+        """`since_throw` s, and `speed` m/s of the root over the ground."""
+        return {
+            "since_throw": self.interval - state.next_throw,
+            "speed": jnp.sqrt(jnp.sum(_drift(scene, body) ** 2) + 1e-12),
+        }
 
 
 def _drift(scene: physics.Scene, body: physics.State) -> Array:

@@ -44,6 +44,7 @@ class Trampoline(Task):
     name: ClassVar[str] = "trampoline"
     clips: ClassVar[tuple[str, ...]] = ("stand", "balance", "jump", "jump_series")
     state_size: ClassVar[int] = 8
+    clock: ClassVar[str | None] = "since_bounce"
 
     interval: float = 3.0
     """s between two bounces, Sec. 5.3."""
@@ -170,6 +171,17 @@ class Trampoline(Task):
     ) -> Array:
         """Height of the plate's middle."""
         return body.qpos[int(scene.model.joint("plate_z").qposadr[0])]
+
+    def evaluate(
+        self, scene: physics.Scene, state: State, body: physics.State
+    ) -> dict[str, Array]:
+        """`since_bounce` s since the last kick began, `plate_height` m, `in_flight`."""
+        to_come = state.next_bounce > 0.0
+        return {
+            "since_bounce": jnp.where(to_come, self.interval, 0.0) - state.next_bounce,
+            "plate_height": self.ground_height(scene, state, body),
+            "in_flight": state.airborne > self.flight_time,
+        }
 
 
 def _foot_force(

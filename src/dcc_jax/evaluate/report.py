@@ -1,0 +1,325 @@
+"""The evaluation: conditions played, measured, summed up and compared in pairs.
+
+Letters: N episodes, K contacts.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dcc_jax.env.environment import CONTROL_RATE
+from dcc_jax.env.task import Task
+from dcc_jax.evaluate import bootstrap, measures
+from dcc_jax.evaluate.bootstrap import Interval
+from dcc_jax.evaluate.episodes import Player, Recording
+from dcc_jax.evaluate.runs import Run, find_run, make_environment
+from dcc_jax.learn import style
+
+POOLED = {
+    "contact/peak_p95": ("N", "95 % quantile of the contacts' largest forces"),
+    "contact/peak_max": ("N", "the largest of all"),
+    "style/frechet": ("m", "Frechet distance of pose pairs to those of the clips"),
+    "broken": ("", "episodes in which the physics broke"),
+}
+"""Metrics of a condition that are none of one episode: unit and meaning."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A policy at a level of compliance."""
+
+    run: str
+    alpha: float
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A condition against its run's first, or the first of all if each run has one."""
+
+    condition: int  # index into Report.conditions
+    baseline: int
+    ratio: dict[str, Interval]  # by metric, of the means
+    difference: dict[str, Interval]
+
+
+@dataclass(frozen=True)
+class Report:
+    """What an evaluation found."""
+
+    task: str
+    seed: int
+    seconds: float
+    conditions: list[Condition]
+    summary: list[dict[str, Interval]]  # of each condition, by metric
+    comparisons: list[Comparison]
+    rows: list[dict[str, Any]]  # one an episode: run, alpha, episode, metrics
+    contacts: list[dict[str, Any]]  # one a contact: run, alpha, episode, start, ...
+    clock: str | None  # what the curves are drawn over; None: time since the reset
+    curves: list[dict[str, list[list[float]]]]  # of each condition: s, mean, half width
+    survival: list[list[float]]  # of each condition: share standing after each step
+
+    def to_json(self) -> str:
+        """Everything as json; numbers that are undefined become null."""
+        return json.dumps(_defined(asdict(self)), indent=1) + "\n"
+
+
+def evaluate(
+    run_dir: str | Path | Sequence[str | Path],
+    *,
+    episodes: int = 256,
+    alpha: Sequence[float] | None = None,
+    seed: int = 0,
+    seconds: float | None = None,
+    task: Task | None = None,
+    say: Callable[[str], None] = lambda _: None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Report:
+    """Plays episodes of the mean action and measures them.
+
+    Episodes are paired: the same initial states and perturbations for every level of
+    compliance and every run.
+
+    Args:
+        run_dir: a run directory, a policy that ships, or several of them.
+        episodes: of each condition.
+        alpha: levels of compliance; None: the least and the greatest of the training.
+        seed: of everything that is drawn.
+        seconds: length of an episode; None: as in training.
+        task: in place of the configured one, e.g. with other parameters.
+        say: told what a reader of the numbers has to know.
+        progress: told control steps done and to be done.
+
+    Raises:
+        ValueError: naming the argument, its value and what is allowed.
+    """
+    plan = prepare(run_dir, episodes, alpha, seed, seconds, task, say)
+    return execute(plan, progress)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """An evaluation that is about to begin: its input is checked."""
+
+    conditions: list[tuple[Run, float]]
+    players: dict[str, Player]  # by run
+    episodes: int
+    seed: int
+    seconds: float
+
+
+def prepare(
+    run_dir: str | Path | Sequence[str | Path],
+    episodes: int,
+    alpha: Sequence[float] | None,
+    seed: int,
+    seconds: float | None,
+    task: Task | None,
+    say: Callable[[str], None],
+) -> Plan:
+    """Checks everything a user can get wrong; arguments as of `evaluate`."""
+    names = [run_dir] if isinstance(run_dir, str | Path) else list(run_dir)
+    runs = [find_run(name) for name in names]
+    _check(runs, episodes, alpha, seed, seconds)
+    return Plan(
+        conditions=[(run, level) for run in runs for level in _levels(run, alpha, say)],
+        players=_players(runs, task),
+        episodes=episodes,
+        seed=seed,
+        seconds=runs[0].config.env.episode_seconds if seconds is None else seconds,
+    )
+
+
+def execute(plan: Plan, progress: Callable[[int, int], None]) -> Report:
+    """Plays and measures."""
+    steps = round(plan.seconds * CONTROL_RATE) * plan.episodes
+    total = steps * len(plan.conditions)
+    parts = []
+    for i, (run, level) in enumerate(plan.conditions):
+        player = plan.players[run.name]
+        recording = player.play(
+            run,
+            range(plan.episodes),
+            [level] * plan.episodes,
+            seed=plan.seed,
+            seconds=plan.seconds,
+            progress=lambda done, i=i: progress(i * steps + done, total),
+        )
+        parts.append(_part(player, recording, Condition(run.name, level)))
+    return _report(parts, plan)
+
+
+def _check(
+    runs: list[Run],
+    count: int,
+    alpha: Sequence[float] | None,
+    seed: int,
+    seconds: float | None,
+) -> None:
+    if not runs:
+        raise ValueError("run_dir is empty; give at least one run")
+    if count < 1:
+        raise ValueError(f"episodes must be 1 or more, got {count}")
+    for level in alpha if alpha is not None else ():
+        if not 0.0 <= level <= 1.0:
+            raise ValueError(f"alpha must be in [0, 1], got {level}")
+    if alpha is not None and len(set(alpha)) < max(1, len(alpha)):
+        raise ValueError(f"alpha must be different numbers, got {list(alpha)}")
+    if not 0 <= seed < 2**32:
+        raise ValueError(f"seed must be between 0 and 2^32 - 1, got {seed}")
+    if seconds is not None and not 0.1 <= seconds <= 3600.0:
+        raise ValueError(f"seconds must be in [0.1, 3600], got {seconds}")
+    if len({run.name for run in runs}) < len(runs):
+        raise ValueError(f"a run is given twice: {', '.join(r.name for r in runs)}")
+    tasks = sorted({run.config.task for run in runs})
+    if len(tasks) > 1:
+        raise ValueError(f"the runs must be of one task, got {', '.join(tasks)}")
+
+
+def _levels(
+    run: Run, alpha: Sequence[float] | None, say: Callable[[str], None]
+) -> list[float]:
+    low, high = run.alphas
+    if alpha is None:
+        return sorted({low, high})
+    strange = [f"{x:g}" for x in alpha if not low - 1e-6 <= x <= high + 1e-6]
+    if strange:
+        trained = f"{low:g}" if low == high else f"{low:g} to {high:g}"
+        say(
+            f"{run.name} was trained at alpha {trained}: at {', '.join(strange)} its "
+            "policy observes the nearest alpha that it knows"
+        )
+    return [float(level) for level in alpha]
+
+
+def _players(runs: list[Run], task: Task | None) -> dict[str, Player]:
+    """By run. Runs whose environments differ in alpha alone share a program."""
+    shared: dict[str, Player] = {}
+    players = {}
+    for run in runs:
+        environment = make_environment(run, task)
+        same = repr(asdict(run.config.env) | {"alpha": None, "alpha_max": None})
+        players[run.name] = shared.setdefault(same, Player(environment))
+    return players
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One condition, measured."""
+
+    condition: Condition
+    rows: list[dict[str, float]]
+    contacts: list[list[dict[str, float]]]  # of each episode
+    pooled: dict[str, float]
+    curves: dict[str, list[list[float]]]
+    survival: list[float]
+
+
+def _part(player: Player, recording: Recording, condition: Condition) -> _Part:
+    clips = jax.jit(lambda: style.make_reference(player.environment))()
+    nearest = np.full(recording.pairs_alive.shape, np.nan)
+    alive = recording.pairs_alive
+    pairs = jnp.asarray(recording.pairs[alive])
+    frechet = np.nan
+    if len(pairs):
+        nearest[alive] = style.nearest(clips, pairs)
+        frechet = float(style.frechet(clips, pairs, jnp.ones(len(pairs))))
+    contacts = [measures.contacts_of(recording, n) for n in range(len(recording.fell))]
+    return _Part(
+        condition=condition,
+        rows=measures.rows(recording, nearest, contacts),
+        contacts=contacts,
+        pooled={"style/frechet": frechet, "broken": float(recording.nan.sum())},
+        curves=measures.curves(recording, player.environment.task.clock),
+        survival=measures.survival(recording),
+    )
+
+
+def _report(parts: list[_Part], plan: Plan) -> Report:
+    task = plan.players[parts[0].condition.run].environment.task
+    resamples = bootstrap.draws(plan.episodes)
+    several = any(p.condition.run == parts[0].condition.run for p in parts[1:])
+    comparisons = []
+    for i, part in enumerate(parts):
+        same = [j for j, p in enumerate(parts) if p.condition.run == part.condition.run]
+        baseline = same[0] if several else 0
+        if i != baseline:
+            comparisons.append(_compared(parts, i, baseline, resamples))
+    return Report(
+        task=task.name,
+        seed=plan.seed,
+        seconds=plan.seconds,
+        conditions=[part.condition for part in parts],
+        summary=[_summary(part, resamples) for part in parts],
+        comparisons=comparisons,
+        rows=[
+            _named(part, n) | row for part in parts for n, row in enumerate(part.rows)
+        ],
+        contacts=[
+            _named(part, n) | contact
+            for part in parts
+            for n, of_episode in enumerate(part.contacts)
+            for contact in of_episode
+        ],
+        clock=task.clock,
+        curves=[part.curves for part in parts],
+        survival=[part.survival for part in parts],
+    )
+
+
+def _named(part: _Part, episode: int) -> dict[str, Any]:
+    return {**asdict(part.condition), "episode": episode}
+
+
+def _column(part: _Part, name: str) -> np.ndarray:
+    return np.array([row[name] for row in part.rows])
+
+
+def _summary(part: _Part, resamples: np.ndarray) -> dict[str, Interval]:
+    columns = {name: _column(part, name) for name in part.rows[0]}
+    summary = {
+        name: bootstrap.share(values)
+        if name == "fell"
+        else bootstrap.mean(values, resamples)
+        for name, values in columns.items()
+    }
+    peaks = [(c["peak"], n) for n, cs in enumerate(part.contacts) for c in cs]
+    values, episode = np.array(peaks).reshape(-1, 2).T
+    nothing = np.nan, np.nan
+    summary["contact/peak_p95"] = bootstrap.quantile(
+        values, episode.astype(int), 0.95, resamples
+    )
+    summary["contact/peak_max"] = Interval(values.max(initial=0.0), *nothing)
+    return summary | {k: Interval(v, *nothing) for k, v in part.pooled.items()}
+
+
+def _compared(
+    parts: list[_Part], i: int, baseline: int, resamples: np.ndarray
+) -> Comparison:
+    pairs = {
+        name: (_column(parts[i], name), _column(parts[baseline], name), resamples)
+        for name in parts[i].rows[0]
+    }
+    return Comparison(
+        condition=i,
+        baseline=baseline,
+        ratio={name: bootstrap.ratio(*pair) for name, pair in pairs.items()},
+        difference={name: bootstrap.difference(*pair) for name, pair in pairs.items()},
+    )
+
+
+def _defined(value: Any) -> Any:
+    """The same tree with null in place of numbers that are not finite."""
+    if isinstance(value, dict):
+        return {k: _defined(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_defined(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

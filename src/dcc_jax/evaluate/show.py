@@ -1,0 +1,180 @@
+"""An evaluation as a table and as a page of figures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from dcc_jax.evaluate.bootstrap import Interval
+from dcc_jax.evaluate.measures import CURVES, DT, METRICS
+from dcc_jax.evaluate.report import POOLED, Comparison, Report
+
+COLOURS = ("#1f6fb4", "#c8553d", "#3a7d44", "#8a5fb0", "#b8860b", "#555555")
+COMPARED = (
+    "contact/peak",
+    "contact/impulse",
+    "contact/seconds",
+    "contact/torque",
+    "torque/rms",
+    "power",
+    "skate",
+    "style/nearest",
+)
+"""Metrics whose ratios are drawn; the first and the fourth are Fig. 4."""
+NO_RATIO = ("fell", "u/", "contact/energy", "energy", "range", "task/")
+"""Metrics that may be zero or of either sign: differences are shown."""
+COLUMNS = 3
+
+
+def table(report: Report) -> Table:
+    """One row a metric, one column a condition, one more a comparison."""
+    page = Table(title=f"{_title(report)}; means [95 % interval]", title_justify="left")
+    page.add_column("", no_wrap=True)
+    for i, _ in enumerate(report.conditions):
+        page.add_column(_name(report, i), justify="right", no_wrap=True)
+    for comparison in report.comparisons:
+        page.add_column(_versus(report, comparison), justify="right", no_wrap=True)
+    known = METRICS | POOLED
+    for name in report.summary[0]:
+        unit = known[name][0] if name in known else ""
+        cells = [_text(summary[name]) for summary in report.summary]
+        cells += [_compared(comparison, name) for comparison in report.comparisons]
+        page.add_row(f"{name} {unit and f'({unit})'}", *cells)
+    return page
+
+
+def check_format(path: Path) -> None:
+    """Raises ValueError where the ending of a picture's name is no known format."""
+    ending = path.suffix.lstrip(".").lower()
+    known = FigureCanvasAgg(Figure()).get_supported_filetypes()
+    if ending not in known:
+        raise ValueError(
+            f"--figure {path}: cannot write {ending!r} pictures, only "
+            f"{', '.join(sorted(known))}"
+        )
+
+
+def figure(report: Report, path: Path) -> None:
+    """Writes a page: who stands, how hard contacts are, ratios, and curves over time.
+
+    Curves show the mean over episodes and its 95 % interval.
+    """
+    names = [name for name, *_ in CURVES] + sorted(
+        {n for curves in report.curves for n in curves if n.startswith("task/")}
+    )
+    drawn = [n for n in names if any(c[n][0] for c in report.curves)]
+    count = 3 + len(drawn)
+    lines = -(-count // COLUMNS)
+    page = Figure(figsize=(5.2 * COLUMNS, 3.2 * lines + 0.5), layout="constrained")
+    FigureCanvasAgg(page)
+    axes = page.subplots(lines, COLUMNS, squeeze=False).ravel()
+    _draw_survival(axes[0], report)
+    _draw_peaks(axes[1], report)
+    _draw_ratios(axes[2], report)
+    for place, name in zip(axes[3:], drawn, strict=False):
+        _draw_curve(place, report, name)
+    for place in axes[count:]:
+        place.axis("off")
+    page.suptitle(_title(report))
+    page.savefig(path, dpi=90)
+
+
+def _draw_survival(axes: Axes, report: Report) -> None:
+    for i, share in enumerate(report.survival):
+        time = DT * np.arange(1, len(share) + 1)
+        axes.plot(time, share, color=_colour(i), label=_name(report, i))
+    axes.set(title="share still standing", xlabel="s", ylim=(-0.03, 1.03))
+    axes.legend(fontsize=8, loc="lower left")
+
+
+def _draw_peaks(axes: Axes, report: Report) -> None:
+    for i, condition in enumerate(report.conditions):
+        peaks = sorted(
+            contact["peak"]
+            for contact in report.contacts
+            if (contact["run"], contact["alpha"]) == (condition.run, condition.alpha)
+        )
+        axes.plot(peaks, np.linspace(0.0, 1.0, len(peaks)), color=_colour(i))
+    axes.set(title="peak force of a contact: share below", xlabel="N")
+
+
+def _draw_ratios(axes: Axes, report: Report) -> None:
+    axes.axvline(1.0, color="0.6", lw=0.8)
+    for c, comparison in enumerate(report.comparisons):
+        for line, name in enumerate(COMPARED):
+            ratio = comparison.ratio[name]
+            height = -line - 0.15 * c
+            axes.plot([ratio.low, ratio.high], [height] * 2, color=_colour(c + 1))
+            axes.plot(ratio.value, height, "o", color=_colour(c + 1), ms=4)
+    low, high = axes.get_xlim()
+    axes.set_xlim(min(low, 0.9), max(high, 1.1))
+    axes.set_yticks(-np.arange(len(COMPARED)), COMPARED, fontsize=8)
+    baseline = _name(report, 0) if report.comparisons else "nothing to compare with"
+    axes.set_title(f"ratio of means to {baseline}")
+
+
+def _draw_curve(axes: Axes, report: Report, name: str) -> None:
+    for i, curves in enumerate(report.curves):
+        time, mean, half = map(np.array, curves[name])
+        axes.plot(time, mean, color=_colour(i))
+        axes.fill_between(
+            time, mean - half, mean + half, color=_colour(i), alpha=0.2, lw=0.0
+        )
+    unit = dict(CURVES).get(name)
+    since = report.clock or "since the reset"
+    axes.set(
+        title=f"{name} ({unit})" if unit else name,
+        xlabel=f"s {since.replace('_', ' ')}",
+    )
+
+
+def _title(report: Report) -> str:
+    count = len(report.rows) // len(report.conditions)
+    return (
+        f"{report.task}: {count} episodes of {report.seconds:g} s, seed {report.seed}, "
+        "the same perturbations for all"
+    )
+
+
+def _name(report: Report, i: int) -> str:
+    condition = report.conditions[i]
+    several = len({c.run for c in report.conditions}) > 1
+    run = f"{Path(condition.run).name} " if several else ""
+    return f"{run}alpha {condition.alpha:g}"
+
+
+def _versus(report: Report, comparison: Comparison) -> str:
+    condition, baseline = (
+        _name(report, i) for i in (comparison.condition, comparison.baseline)
+    )
+    return f"{condition} / {baseline}"
+
+
+def _compared(comparison: Comparison, name: str) -> str:
+    """The ratio of means, or the difference where a ratio says nothing."""
+    if name not in comparison.ratio:
+        return ""
+    if (
+        name == "fell"
+        or name.startswith("task/")
+        or name in ("contact/energy", "energy")
+    ):
+        return f"diff {_text(comparison.difference[name])}"
+    return _text(comparison.ratio[name])
+
+
+def _text(interval: Interval) -> str:
+    if np.isnan(interval.value):
+        return "-"
+    if np.isnan(interval.low):
+        return f"{interval.value:.3g}"
+    return f"{interval.value:.3g} [{interval.low:.3g}, {interval.high:.3g}]"
+
+
+def _colour(i: int) -> str:
+    return COLOURS[i % len(COLOURS)]
