@@ -31,7 +31,8 @@ import numpy as np
 from dcc_jax import quat
 from dcc_jax.character import Character
 from dcc_jax.quat import Coordinates
-from dcc_jax.solver import Rows, newton
+from dcc_jax.solver import Rows, newton, solve_mass
+from dcc_jax.sparsity import Arrow, arrow
 
 with contextlib.redirect_stdout(io.StringIO()):
     # It prints that Warp is missing, which only CUDA could use.
@@ -54,6 +55,7 @@ class Scene:
     mjx_model: mjx.Model  # on the device; constants of the compiled program
     template: mjx.Data  # constant: every step starts from it, only `State` is carried
     contact_bodies: np.ndarray  # [C, 2] body ids; the force acts on the second
+    arrow: Arrow  # where the matrices of the solver can be non-zero
 
     @property
     def timestep(self) -> float:
@@ -90,7 +92,7 @@ def make_scene(
     character: Character,
     *,
     root: str = "root",
-    newton_iterations: int = 4,
+    newton_iterations: int = 3,
 ) -> Scene:
     """A scene ready to step, its stable PD built in.
 
@@ -116,6 +118,7 @@ def make_scene(
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     mjx_model = mjx.put_model(model)
     template = mjx.make_data(mjx_model)
+    contact_bodies = _contact_bodies(model, mjx_model, template)
     return Scene(
         model=model,
         character=character,
@@ -126,7 +129,8 @@ def make_scene(
         spd_diagonal=spd,
         mjx_model=mjx_model,
         template=template,
-        contact_bodies=_contact_bodies(model, mjx_model, template),
+        contact_bodies=contact_bodies,
+        arrow=arrow(model, _row_pattern(model, contact_bodies)),
     )
 
 
@@ -139,6 +143,33 @@ def _contact_bodies(
     """
     geoms = jax.jit(lambda: mjx.collision(mjx_model, template)._impl.contact.geom)()
     return model.geom_bodyid[np.asarray(geoms)]
+
+
+def _row_pattern(model: mujoco.MjModel, contact_bodies: np.ndarray) -> np.ndarray:
+    """[R, nv] where MJX's constraint rows can be non-zero, in its order of rows."""
+    rows = []
+    order = (mujoco.mjtEq.mjEQ_CONNECT, 3), (mujoco.mjtEq.mjEQ_WELD, 6)
+    for kind, count in order:
+        for i in np.flatnonzero(model.eq_type == kind):
+            one, other = model.eq_obj1id[i], model.eq_obj2id[i]
+            rows += [_chain(model, one) | _chain(model, other)] * count
+    for i in np.flatnonzero(model.jnt_limited):
+        row = np.zeros(model.nv, bool)
+        row[model.dof_jntid == i] = True
+        rows.append(row)
+    for one, other in contact_bodies:
+        rows += [_chain(model, one) | _chain(model, other)] * 4
+    return np.array(rows, bool).reshape(-1, model.nv)
+
+
+def _chain(model: mujoco.MjModel, body: int) -> np.ndarray:
+    """[nv] the degrees of freedom that move a body."""
+    moves = np.zeros(model.nv, bool)
+    while body:
+        start = model.body_dofadr[body]
+        moves[start : start + model.body_dofnum[body]] = True
+        body = model.body_parentid[body]
+    return moves
 
 
 @flax.struct.dataclass
@@ -236,7 +267,9 @@ def solve(scene: Scene, kin: Kinematics, state: State, qfrc: Array) -> Solution:
         num_equality=data._impl.ne,
     )
     mass = mjx.full_m(model, data)
-    qacc, force = newton(mass, smooth, rows, state.qacc, scene.newton_iterations)
+    qacc, force = newton(
+        scene.arrow, mass, smooth, rows, state.qacc, scene.newton_iterations
+    )
     contact_force_w, contact_point_w = _contact_forces(data, force)
     return Solution(
         qacc=qacc,
@@ -274,12 +307,10 @@ def point_jacobian(scene: Scene, kin: Kinematics, point_w: Array, body: Array) -
 
 
 def mass_solve(scene: Scene, kin: Kinematics, qfrc: Array) -> Array:
-    """M^-1 qfrc with the true mass matrix (no h*kv): [nv] or [F, nv] -> the same.
+    """M^-1 qfrc [nv] with the true mass matrix (no h*kv).
 
     With qfrc = J^T f this is FD(q, qd, f) - FD(q, qd, 0) of Alg. 1, because forward
     dynamics is linear in the external force.
     """
     mass = mjx.full_m(scene.mjx_model, kin.data) - jnp.diag(scene.spd_diagonal)
-    factor = jax.scipy.linalg.cho_factor(mass)
-    solved = jax.scipy.linalg.cho_solve(factor, jnp.atleast_2d(qfrc).T).T
-    return solved.reshape(qfrc.shape)
+    return solve_mass(scene.arrow, mass, qfrc)

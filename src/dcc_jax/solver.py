@@ -6,18 +6,33 @@ MuJoCo's forward dynamics with soft constraints is the convex problem
 
 where s_i is the quadratic 1/2 D x^2, for inequality rows (contact pyramid edges,
 limits) only where x < 0. Its gradient is piecewise linear, so Newton with an exact line
-search converges in a few iterations. Their number is fixed and unrolled: under vmap a
-`while_loop` would copy every environment's state in every iteration.
+search converges in a few iterations, whose number is fixed.
+
+The public functions are written for ONE environment. Under `vmap` they run with the
+batch as the LAST axis, so that a CPU's vector units work on many environments at once,
+and on the limbs of one size side by side (`sparsity`). Inside, every array is
+[..., B], and an unknown vector is a `Split`: the limbs' parts and the core's.
+
+Letters: R rows; G limbs of a stack, n unknowns each, coupled with k of the core's c.
+Loops are rolled on purpose: XLA's CPU backend fuses unrolled recurrences into ever
+larger kernels, which compute the same numbers again and again (docs/performance.md).
 """
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
+
+from dcc_jax.sparsity import BLOCK, Arrow, Stack
 
 Array = jax.Array
-LINE_SEARCH_ITERATIONS = 6
+LINE_SEARCH_ITERATIONS = 4
 
 
 @flax.struct.dataclass
@@ -31,70 +46,363 @@ class Rows:
 
 
 def newton(
-    mass: Array, smooth: Array, rows: Rows, start: Array, iterations: int
+    shape: Arrow, mass: Array, smooth: Array, rows: Rows, start: Array, iterations: int
 ) -> tuple[Array, Array]:
     """Accelerations [nv] and row forces [R].
 
     Args:
+        shape: of the scene's matrices.
         mass: M [nv, nv], what multiplies the acceleration.
         smooth: all other generalized forces [nv].
         rows: the constraints.
         start: accelerations to start from [nv], e.g. the last step's.
-        iterations: Newton iterations, unrolled.
+        iterations: Newton iterations.
     """
-    qacc = start
-    residual = rows.J @ qacc - rows.aref
-    mass_qacc = mass @ qacc
-    for _ in range(iterations):
-        active = _active(rows, residual)
-        force = -active * rows.D * residual
-        gradient = mass_qacc - smooth - rows.J.T @ force
-        hessian = mass + (rows.J.T * (active * rows.D)) @ rows.J
-        factor = jax.scipy.linalg.cho_factor(hessian)
-        search = -jax.scipy.linalg.cho_solve(factor, gradient)
-        slope, mass_search = rows.J @ search, mass @ search
-        step = _line_search(
-            rows,
-            residual,
-            slope,
-            search @ (mass_qacc - smooth),
-            search @ mass_search,
+    solve = _batch_last(
+        functools.partial(_newton, shape, rows.num_equality, iterations)
+    )
+    return solve(mass, smooth, rows.J, rows.D, rows.aref, start)
+
+
+def solve_mass(shape: Arrow, mass: Array, force: Array) -> Array:
+    """M^-1 force, for M [nv, nv] and force [nv]."""
+    return _batch_last(functools.partial(_solve_mass, shape))(mass, force)
+
+
+def _batch_last(function: Callable) -> Callable:
+    """`function` of arrays [..., B] as one of arrays without a batch; vmap gives B."""
+
+    @jax.custom_batching.custom_vmap
+    def one(*args: Array):
+        out = function(*(x[..., None] for x in args))
+        return jax.tree.map(lambda x: x[..., 0], out)
+
+    @one.def_vmap
+    def many(size: int, batched: list[bool], *args: Array):
+        args = tuple(
+            jnp.moveaxis(x, 0, -1)
+            if has
+            else jnp.broadcast_to(x[..., None], (*x.shape, size))
+            for x, has in zip(args, batched, strict=True)
         )
-        qacc += step * search
-        residual += step * slope
-        mass_qacc += step * mass_search
-    return qacc, -_active(rows, residual) * rows.D * residual
+        out = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), function(*args))
+        return out, jax.tree.map(lambda _: True, out)
+
+    return one
 
 
-def _active(rows: Rows, residual: Array) -> Array:
-    always = jnp.arange(residual.shape[0]) < rows.num_equality
-    return (always | (residual < 0)).astype(residual.dtype)
+class Split(NamedTuple):
+    """A vector of the scene's unknowns."""
+
+    limbs: tuple[Array, ...]  # one [G, n, B] a stack
+    core: Array  # [c, B]
+
+
+class Fronts(NamedTuple):
+    """A matrix in the arrow's shape: what couples limb and core is in the limb's."""
+
+    limbs: tuple[Array, ...]  # one [G, n + k, n + k, B] a stack
+    core: Array  # [c, c, B]
+
+
+def _newton(
+    shape: Arrow,
+    num_equality: int,
+    iterations: int,
+    mass: Array,
+    smooth: Array,
+    J: Array,
+    D: Array,
+    aref: Array,
+    start: Array,
+) -> tuple[Array, Array]:
+    order = _row_order(shape)
+    J_parts = _row_parts(shape, J)
+    D, aref = _take(D, order), _take(aref, order)
+    always = jnp.asarray(order < num_equality)[:, None]
+    M = _fronts(shape, mass)
+    smooth_parts = _split(shape, smooth)
+
+    def weights(residual: Array) -> Array:
+        return jnp.where(always | (residual < 0), D, 0.0)
+
+    def system(residual: Array, mass_qacc: Split) -> tuple[Fronts, Split, Split]:
+        gauss = jax.tree.map(jnp.subtract, mass_qacc, smooth_parts)
+        weight = weights(residual)
+        return *_assembled(shape, M, gauss, J_parts, weight, residual), gauss
+
+    # The linear system is carried from one iteration into the next, and so computed
+    # once: XLA would compute parts of it again wherever the factorization needs them.
+    def iterated(_: int, carry: tuple) -> tuple:
+        qacc, residual, mass_qacc, (H, gradient, gauss) = carry
+        search = _solve(shape, H, jax.tree.map(jnp.negative, gradient))
+        slope = _rows_times(shape, J_parts, search)
+        mass_search = _times(shape, M, search)
+        step = _line_search(
+            weights, residual, slope, _dot(search, gauss), _dot(search, mass_search)
+        )
+        qacc = jax.tree.map(lambda a, d: a + step * d, qacc, search)
+        residual = residual + step * slope
+        mass_qacc = jax.tree.map(lambda a, d: a + step * d, mass_qacc, mass_search)
+        return qacc, residual, mass_qacc, system(residual, mass_qacc)
+
+    qacc = _split(shape, start)
+    residual = _rows_times(shape, J_parts, qacc) - aref
+    mass_qacc = _times(shape, M, qacc)
+    carry = (qacc, residual, mass_qacc, system(residual, mass_qacc))
+    qacc, residual, *_ = jax.lax.fori_loop(0, iterations, iterated, carry)
+    force = -weights(residual) * residual
+    back = np.empty(shape.num_rows, int)
+    real = order < shape.num_rows
+    back[order[real]] = np.flatnonzero(real)
+    return _joined(shape, qacc), force[back]
+
+
+def _solve_mass(shape: Arrow, mass: Array, force: Array) -> Array:
+    return _joined(shape, _solve(shape, _fronts(shape, mass), _split(shape, force)))
 
 
 def _line_search(
-    rows: Rows, residual: Array, slope: Array, gauss_1: Array, gauss_2: Array
+    weights: Callable, residual: Array, slope: Array, gauss_1: Array, gauss_2: Array
 ) -> Array:
-    """The step that minimizes the cost along the search direction.
+    """The step [B] that minimizes the cost along the search direction.
 
     Its derivative is increasing and piecewise linear; Newton from 1 lands on the right
     piece within a few steps, kept inside the bracket found so far.
     """
 
-    def derivatives(t: Array) -> tuple[Array, Array]:
-        x = residual + t * slope
-        weight = _active(rows, x) * rows.D * slope
-        return gauss_1 + t * gauss_2 + weight @ x, gauss_2 + weight @ slope
-
     def narrowed(_: int, carry: tuple[Array, Array, Array]) -> tuple[Array, ...]:
         low, high, t = carry
-        first, second = derivatives(t)
+        x = residual + t * slope
+        weighted = weights(x) * slope
+        first = gauss_1 + t * gauss_2 + jnp.sum(weighted * x, axis=0)
+        second = gauss_2 + jnp.sum(weighted * slope, axis=0)
         low = jnp.where(first < 0, t, low)
         high = jnp.where(first < 0, high, t)
         proposed = t - first / jnp.maximum(second, 1e-12)
         inside = (proposed >= low) & (proposed <= high)
         return low, high, jnp.where(inside, proposed, 0.5 * (low + high))
 
-    # A rolled loop: unrolled, XLA would fuse each reduction into the next one and
-    # compute it again for every row.
-    start = (jnp.zeros(()), jnp.full((), 4.0), jnp.ones(()))
-    return jax.lax.fori_loop(0, LINE_SEARCH_ITERATIONS, narrowed, start)[2]
+    one = jnp.ones_like(gauss_1)
+    return jax.lax.fori_loop(
+        0, LINE_SEARCH_ITERATIONS, narrowed, (0 * one, 4 * one, one)
+    )[2]
+
+
+# --- the arrow's shape: taking vectors and matrices apart, and together ---
+
+
+def _row_order(shape: Arrow) -> np.ndarray:
+    """Rows stack after stack, then the core's; R stands for padding."""
+    limbs = [stack.rows.ravel() for stack in shape.stacks]
+    return np.concatenate([*limbs, shape.core_rows]).astype(int)
+
+
+def _take(x: Array, index: np.ndarray) -> Array:
+    """x[index] along the first axis, zero where the index is one past the end."""
+    return jnp.concatenate([x, jnp.zeros_like(x[:1])])[index]
+
+
+def _split(shape: Arrow, x: Array) -> Split:
+    limbs = tuple(_take(x, stack.dofs) for stack in shape.stacks)
+    return Split(limbs, _take(x, shape.core))
+
+
+def _joined(shape: Arrow, x: Split) -> Array:
+    """The inverse of `_split`, [nv, B]."""
+    index = np.concatenate([*(s.dofs.ravel() for s in shape.stacks), shape.core])
+    parts = [part.reshape(-1, part.shape[-1]) for part in x.limbs]
+    real = index < shape.nv
+    back = np.empty(shape.nv, int)
+    back[index[real]] = np.flatnonzero(real)
+    return jnp.concatenate([*parts, x.core])[back]
+
+
+def _fronts(shape: Arrow, mass: Array) -> Fronts:
+    flat = mass.reshape(-1, mass.shape[-1])
+
+    def front(position: np.ndarray, identity: np.ndarray) -> Array:
+        return _take(flat, position) + jnp.asarray(identity, flat.dtype)[..., None]
+
+    limbs = tuple(front(s.mass, s.identity) for s in shape.stacks)
+    return Fronts(limbs, front(shape.core_mass, shape.core_identity))
+
+
+def _row_parts(shape: Arrow, J: Array) -> Split:
+    """The rows' non-zero columns: a stack's [G, r, n + k, B], the core's [r, c, B]."""
+    padded = jnp.pad(J, ((0, 1), (0, 1), (0, 0)))
+    core = np.append(shape.core, shape.nv)
+
+    def part(stack: Stack) -> Array:
+        columns = np.concatenate([stack.dofs, core[stack.core]], axis=1)
+        return padded[stack.rows[:, :, None], columns[:, None, :]]
+
+    own = padded[shape.core_rows[:, None], shape.core]
+    return Split(tuple(part(stack) for stack in shape.stacks), own)
+
+
+def _with_core(stack: Stack, limbs: Array, core: Array) -> Array:
+    """The unknowns [G, n + k, B] that the fronts of a stack see."""
+    return jnp.concatenate([limbs, _take(core, stack.core)], axis=1)
+
+
+def _add_to_core(stack: Stack, core: Array, parts: Array) -> Array:
+    """core [c, (c,) B] plus what every front [G, k, (k,) B] has for it."""
+    for columns, part in zip(stack.core, parts, strict=True):
+        real = np.flatnonzero(columns < core.shape[0])
+        target = columns[real]
+        if part.ndim == 2:
+            core = core.at[target].add(part[real])
+        else:
+            core = core.at[target[:, None], target].add(part[real[:, None], real])
+    return core
+
+
+# --- products and sums ---
+
+
+def _dot(a: Split, b: Split) -> Array:
+    """[B]"""
+    products = jax.tree.map(lambda x, y: (x * y).reshape(-1, x.shape[-1]), a, b)
+    return sum(jnp.sum(x, axis=0) for x in jax.tree.leaves(products))  # pyright: ignore
+
+
+def _matvec(A: Array, x: Array) -> Array:
+    """A [..., i, j, B] times x [..., j, B], written out: one fused kernel."""
+    terms = [A[..., j, :] * x[..., None, j, :] for j in range(x.shape[-2])]
+    return functools.reduce(jnp.add, terms)
+
+
+def _times(shape: Arrow, A: Fronts, x: Split) -> Split:
+    """A x."""
+    core = _matvec(A.core, x.core)
+    limbs = []
+    for stack, front, part in zip(shape.stacks, A.limbs, x.limbs, strict=True):
+        product = _matvec(front, _with_core(stack, part, x.core))
+        size = part.shape[1]
+        limbs.append(product[:, :size])
+        core = _add_to_core(stack, core, product[:, size:])
+    return Split(tuple(limbs), core)
+
+
+def _rows_times(shape: Arrow, J: Split, x: Split) -> Array:
+    """J x in the order of `_row_order`."""
+    parts = []
+    for stack, rows, part in zip(shape.stacks, J.limbs, x.limbs, strict=True):
+        product = _matvec(rows, _with_core(stack, part, x.core))
+        parts.append(product.reshape(-1, product.shape[-1]))
+    return jnp.concatenate([*parts, _matvec(J.core, x.core)])
+
+
+def _assembled(
+    shape: Arrow, M: Fronts, gauss: Split, J: Split, weight: Array, residual: Array
+) -> tuple[Fronts, Split]:
+    """H = M + J^T W J and the gradient, gauss + J^T W residual."""
+    fronts, limbs, core_gradient, begin = [], [], gauss.core, 0
+    for stack, front, own, rows in zip(
+        shape.stacks, M.limbs, gauss.limbs, J.limbs, strict=True
+    ):
+        count, depth = rows.shape[:2]
+        end = begin + count * depth
+        shaped = count, depth, weight.shape[-1]
+        w, res = (x[begin:end].reshape(shaped) for x in (weight, residual))
+        begin = end
+        gradient = jnp.pad(own, ((0, 0), (0, stack.core.shape[1]), (0, 0)))
+        front, gradient = _outer_sums(front, gradient, rows, w, res)
+        fronts.append(front)
+        limbs.append(gradient[:, : own.shape[1]])
+        core_gradient = _add_to_core(stack, core_gradient, gradient[:, own.shape[1] :])
+    core, core_gradient = _outer_sums(
+        M.core[None],
+        core_gradient[None],
+        J.core[None],
+        weight[None, begin:],
+        residual[None, begin:],
+    )
+    return Fronts(tuple(fronts), core[0]), Split(tuple(limbs), core_gradient[0])
+
+
+def _outer_sums(
+    A: Array, b: Array, rows: Array, weight: Array, residual: Array
+) -> tuple[Array, Array]:
+    """A [G, m, m, B] + sum_r w r r^T and b [G, m, B] + sum_r w r residual."""
+    weighted = weight[:, :, None] * rows
+    for i in range(rows.shape[1]):
+        A = A + weighted[:, i, :, None] * rows[:, i, None, :]
+        b = b + weighted[:, i] * residual[:, i, None]
+    return A, b
+
+
+# --- the factorization ---
+
+
+def _solve(shape: Arrow, A: Fronts, b: Split) -> Split:
+    """A^-1 b: the limbs are eliminated, then the core is solved, then the limbs."""
+    core, core_b = A.core, b.core
+    eliminated = []
+    for stack, front, limb_b in zip(shape.stacks, A.limbs, b.limbs, strict=True):
+        y = jnp.pad(limb_b, ((0, 0), (0, stack.core.shape[1]), (0, 0)))
+        factor, front, y = _eliminate(front, y, limb_b.shape[1])
+        eliminated.append(factor)
+        core = _add_to_core(stack, core, front)
+        core_b = _add_to_core(stack, core_b, y)
+    factor, _, _ = _eliminate(core[None], core_b[None], core.shape[0])
+    x_core = _substitute(factor, core_b[None, :0])
+    limbs = tuple(
+        _substitute(factor, _take(x_core[0], stack.core)[:, : stack.core.shape[1]])
+        for stack, factor in zip(shape.stacks, eliminated, strict=True)
+    )
+    return Split(limbs, x_core[0])
+
+
+def _eliminate(A: Array, b: Array, size: int) -> tuple[list, Array, Array]:
+    """Block elimination of the first `size` unknowns of A x = b.
+
+    A [G, m, m, B] is symmetric positive definite, which needs no pivoting.
+
+    Returns:
+        per block the coupling [G, BLOCK, rest, B] and right side [G, BLOCK, B] of
+        x_block = right - coupling x_rest, then the Schur complement and its right side.
+    """
+    factor = []
+    for _ in range(size // BLOCK):
+        pivot = [[A[:, i, j] for i in range(BLOCK)] for j in range(BLOCK)]
+        panel = [A[:, i, BLOCK:] for i in range(BLOCK)]
+        coupling = _solve_3(pivot, panel)
+        right = _solve_3(pivot, [b[:, i, None] for i in range(BLOCK)])
+        A, b = A[:, BLOCK:, BLOCK:], b[:, BLOCK:]
+        for p, c, r in zip(panel, coupling, right, strict=True):
+            A = A - p[:, :, None] * c[:, None]
+            b = b - p * r
+        factor.append((coupling, right))
+    return factor, A, b
+
+
+def _substitute(factor: list, rest: Array) -> Array:
+    """The unknowns [G, m, B] that belong to those of the rest [G, k, B]."""
+    x = [rest[:, i] for i in range(rest.shape[1])]
+    for coupling, right in reversed(factor):
+        own = []
+        for c, r in zip(coupling, right, strict=True):
+            own.append(r[:, 0] - sum(c[:, j] * value for j, value in enumerate(x)))
+        x = own + x
+    return jnp.stack(x[: len(x) - rest.shape[1]], axis=1)
+
+
+def _solve_3(P: list[list[Array]], y: list[Array]) -> list[Array]:
+    """P^-1 y for P symmetric [3][3] of [G, B] and y [3] of [G, m, B].
+
+    Each result ends in a division on purpose: XLA does not repeat one in every kernel
+    that needs it.
+    """
+    p00, p01, p02 = (P[0][i][:, None] for i in range(3))
+    p11, p12, p22 = P[1][1][:, None], P[1][2][:, None], P[2][2][:, None]
+    l01, l02 = p01 / p00, p02 / p00
+    d1 = p11 - l01 * p01
+    e12 = p12 - l01 * p02
+    l12 = e12 / d1
+    d2 = p22 - l02 * p02 - l12 * e12
+    y1 = y[1] - l01 * y[0]
+    x2 = (y[2] - l02 * y[0] - l12 * y1) / d2
+    x1 = (y1 - e12 * x2) / d1
+    return [(y[0] - p01 * x1 - p02 * x2) / p00, x1, x2]

@@ -1,0 +1,127 @@
+"""The arrow-shaped solver against dense linear algebra in double precision."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from dcc_jax import physics, solver, tasks
+from dcc_jax.character import Character, compose_scene
+from dcc_jax.sparsity import arrow
+
+BATCH = 3
+
+
+@pytest.fixture(scope="module", params=("push", "trampoline", "door"))
+def shape(request, character: Character):
+    """The matrices' shape in scenes with a free body, a moving ground, equalities."""
+    task = tasks.make_task(request.param)
+    model = compose_scene(character, floor=task.has_floor, extend=task.extend)
+    return physics.make_scene(model, character).arrow
+
+
+def _problem(shape, seed: int) -> dict[str, np.ndarray]:
+    """Random matrices with non-zeros wherever the shape has room for them."""
+    rng = np.random.default_rng(seed)
+    room = _room(shape)
+    mass = room * 0.1 * rng.normal(size=(BATCH, shape.nv, shape.nv))
+    mass = mass + mass.swapaxes(1, 2) + np.diag(rng.uniform(8, 9, shape.nv))
+    J = _row_room(shape) * rng.normal(size=(BATCH, shape.num_rows, shape.nv))
+    rows = (BATCH, shape.num_rows)
+    return {
+        "mass": mass,
+        "smooth": rng.normal(size=(BATCH, shape.nv)),
+        "J": J,
+        "D": rng.uniform(0.5, 2.0, rows),
+        "aref": rng.normal(size=rows),
+        "start": rng.normal(size=(BATCH, shape.nv)),
+    }
+
+
+def _room(shape) -> np.ndarray:
+    """[nv, nv] where M may be non-zero."""
+    room = np.zeros(shape.nv**2 + 1, bool)
+    for stack in shape.stacks:
+        room[stack.mass] = True
+    room[shape.core_mass] = True
+    return room[:-1].reshape(shape.nv, shape.nv)
+
+
+def _row_room(shape) -> np.ndarray:
+    """[R, nv] where J may be non-zero."""
+    room = np.zeros((shape.num_rows + 1, shape.nv + 1), bool)
+    core = np.append(shape.core, shape.nv)
+    for stack in shape.stacks:
+        columns = np.concatenate([stack.dofs, core[stack.core]], axis=1)
+        room[stack.rows[:, :, None], columns[:, None]] = True
+    room[np.ix_(shape.core_rows, shape.core)] = True
+    return room[:-1, :-1]
+
+
+def test_every_unknown_and_every_row_has_one_place(shape):
+    dofs = np.concatenate([*(s.dofs.ravel() for s in shape.stacks), shape.core])
+    rows = np.concatenate([*(s.rows.ravel() for s in shape.stacks), shape.core_rows])
+    assert sorted(dofs[dofs < shape.nv]) == list(range(shape.nv))
+    assert sorted(rows[rows < shape.num_rows]) == list(range(shape.num_rows))
+
+
+def test_mass_solve_is_the_dense_one(shape):
+    p = _problem(shape, 0)
+    solve = jax.jit(jax.vmap(lambda m, f: solver.solve_mass(shape, m, f)))
+    x = solve(
+        jnp.asarray(p["mass"], jnp.float32), jnp.asarray(p["smooth"], jnp.float32)
+    )
+    dense = np.linalg.solve(p["mass"], p["smooth"][..., None])[..., 0]
+    np.testing.assert_allclose(x, dense, atol=2e-6)
+
+
+def test_optimum_satisfies_the_conditions_of_the_convex_problem(shape):
+    """M a - smooth = J^T f, with f = -D x where active and 0 elsewhere."""
+    p = _problem(shape, 1)
+    num_equality = min(5, shape.num_rows)
+
+    def one(mass, smooth, J, D, aref, start):
+        rows = solver.Rows(J, D, aref, num_equality)
+        return solver.newton(shape, mass, smooth, rows, start, 8)
+
+    single = [jnp.asarray(value, jnp.float32) for value in p.values()]
+    qacc, force = (np.asarray(x, float) for x in jax.jit(jax.vmap(one))(*single))
+    x = np.einsum("bri,bi->br", p["J"], qacc) - p["aref"]
+    active = (x < 0) | (np.arange(shape.num_rows) < num_equality)
+    assert 0.2 < active.mean() < 0.9, "both kinds of rows must occur"
+    np.testing.assert_allclose(force, -np.where(active, p["D"] * x, 0.0), atol=2e-5)
+    balance = np.einsum("bij,bj->bi", p["mass"], qacc) - p["smooth"]
+    np.testing.assert_allclose(
+        balance, np.einsum("bri,br->bi", p["J"], force), atol=5e-5
+    )
+    alone = jax.jit(one)(*(value[0] for value in single))
+    np.testing.assert_allclose(alone[0], qacc[0], atol=2e-5)
+
+
+def test_limbs_that_touch_each_other_are_solved_together():
+    """A row between two limbs makes one limb of them; the answer stays exact."""
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><freejoint/><geom size='.1'/>"
+        + "<body pos='.2 0 0'><joint type='ball'/><geom size='.1'/></body>" * 2
+        + "</body></worldbody></mujoco>"
+    )
+    apart = arrow(model, np.zeros((0, model.nv), bool))
+    row = np.ones((1, model.nv), bool)
+    joined = arrow(model, row)
+    assert [stack.dofs.shape for stack in apart.stacks] == [(2, 3)]
+    assert [stack.dofs.shape for stack in joined.stacks] == [(1, 6)]
+    p = _problem(joined, 2)
+
+    def one(mass, smooth, J, D, aref, start):
+        return solver.newton(joined, mass, smooth, solver.Rows(J, D, aref, 1), start, 2)
+
+    qacc, _ = jax.vmap(one)(*(jnp.asarray(v, jnp.float32) for v in p.values()))
+    J, D = p["J"], p["D"][..., None]
+    H = p["mass"] + J.swapaxes(1, 2) @ (D * J)
+    right = p["smooth"] + np.einsum("bri,br->bi", J, p["D"] * p["aref"])
+    np.testing.assert_allclose(
+        qacc, np.linalg.solve(H, right[..., None])[..., 0], atol=2e-6
+    )
