@@ -1,0 +1,279 @@
+"""Chicken fight (Sec. 5.3): hop on one leg, bump and be bumped, stay up.
+
+In training the opponent is a box as heavy as the character that stands upright, slides
+over the ground and runs into the character from any side. After a bump it lets go, and
+comes again from elsewhere. The reference's root hops slowly along a path of its own.
+The contact forces with the opponent, one resultant a body, feed the compliance.
+`tasks.match` lets two characters fight each other.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from dcc_jax import physics, quat
+from dcc_jax.character import add_contact
+from dcc_jax.env import features
+from dcc_jax.env.task import (
+    Forces,
+    RootTarget,
+    Task,
+    place_character,
+    resultant,
+)
+from dcc_jax.motion.reference import CONTROL_DT, RefState
+from dcc_jax.tasks import partner
+from dcc_jax.tasks.partner import Gaits, Motion
+
+Array = jax.Array
+
+TARGETS = (
+    "chest",
+    "shoulders",
+    "abdomen",
+    "pelvis",
+    "left_upper_arm",
+    "right_upper_arm",
+)
+"""Geoms of trunk and arms that an opponent can bump into."""
+BODIES = ("pelvis", "chest", "left_upper_arm", "right_upper_arm")
+"""Bodies they belong to, each with a force of its own."""
+FRICTION = 0.5
+HALF_SIZE = (0.15, 0.20, 0.45)  # m, of the box: a trunk's depth, width and height
+BOX_HEIGHT = 1.1  # m, of its middle
+NEVER = 100.0  # s
+
+
+@flax.struct.dataclass
+class State:
+    """The reference's path, the opponent's next attack, and the last bump."""
+
+    motion: Motion  # of the reference's root
+    next_attack: Array  # [] s until then
+    touched: Array  # [] s since the opponent first touched in this attack
+    impulse: Array  # [3] N s on the character in the control step, world
+    force_peak: Array  # [] N, largest sum of its contact forces in the control step
+
+
+@dataclass(frozen=True)
+class ChickenFight(Task):
+    """Hop, and take a bump without falling."""
+
+    name: ClassVar[str] = "chicken-fight"
+    clips: ClassVar[tuple[str, ...]] = ("hop",)
+    state_size: ClassVar[int] = 4
+    clock: ClassVar[str | None] = "since_bump"
+
+    prefix: str = ""
+    """Of the character's names in the scene."""
+    opponent: str = "box"
+    """The opponent's root joint, or the first of a box's; it starts with x and y."""
+    gaits: Gaits = field(default_factory=lambda: Gaits(speeds=(0.0, 0.1, 0.2)))
+    """How the reference's root moves; the clips hop at 0.1 to 0.2 m/s."""
+    interval: float = 3.0
+    """s between two attacks."""
+    speed: tuple[float, float] = (0.3, 1.0)
+    """m/s of the box when it comes."""
+    distance: float = 1.0
+    """m between box and root when it sets off."""
+    off_centre: float = 0.15
+    """m, at most, by which it aims beside the root: bumps turn the character, too."""
+    let_go: float = 0.3
+    """s after the first touch when the box begins to brake."""
+    brake_time: float = 0.2
+    """s, time constant of its braking."""
+
+    def extend(self, spec: mujoco.MjSpec) -> None:
+        """A box as heavy as the character that touches its trunk and arms."""
+        mass = sum(geom.mass for geom in spec.geoms if math.isfinite(geom.mass))
+        box = spec.worldbody.add_body(name="box", pos=[0.0, 0.0, BOX_HEIGHT])
+        slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+        box.add_joint(name="box", type=slide, axis=[1, 0, 0])
+        box.add_joint(name="box_y", type=slide, axis=[0, 1, 0])
+        box.add_joint(name="box_yaw", type=hinge, axis=[0, 0, 1])
+        box.add_geom(
+            name="box",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=HALF_SIZE,
+            mass=mass,
+            rgba=[0.75, 0.35, 0.2, 1.0],
+            contype=0,
+            conaffinity=0,
+        )
+        for target in TARGETS:
+            add_contact(spec, "box", target, FRICTION)
+
+    def reset(
+        self, key: Array, scene: physics.Scene, reference: RefState
+    ) -> tuple[State, Array, Array]:
+        """The box waits out of reach; it comes after a random share of the interval."""
+        way_key, motion_key, attack_key = jax.random.split(key, 3)
+        way = jax.random.uniform(way_key, minval=-jnp.pi, maxval=jnp.pi)
+        root = reference.qpos[:2]
+        state = State(
+            motion=partner.begin(motion_key, self.gaits, root, jnp.zeros(2), way),
+            next_attack=self.interval * jax.random.uniform(attack_key),
+            touched=jnp.full((), NEVER),
+            impulse=jnp.zeros(3),
+            force_peak=jnp.zeros(()),
+        )
+        qpos, qvel = place_character(scene, reference)
+        adr, _ = _address(scene, self.opponent)
+        far = root + 2.0 * self.distance * partner.direction(way)
+        return state, qpos.at[adr : adr + 2].set(far), qvel
+
+    def control_step(
+        self, key: Array, scene: physics.Scene, state: State, body: physics.State
+    ) -> tuple[State, physics.State]:
+        """The reference hops on; the box attacks when its time has come."""
+        motion_key, attack_key = jax.random.split(key)
+        due = state.next_attack <= 0.0
+        attack = self._attack(attack_key, scene, body)
+        retreat = self._retreat(scene, state, body)
+        body = jax.tree.map(lambda a, b: jnp.where(due, a, b), attack, retreat)
+        left = jnp.where(due, self.interval, state.next_attack)
+        return dataclasses.replace(
+            state,
+            motion=partner.go_on(motion_key, self.gaits, state.motion),
+            next_attack=left - CONTROL_DT,
+            touched=jnp.where(due, NEVER, state.touched),
+            impulse=jnp.zeros(3),
+            force_peak=jnp.zeros(()),
+        ), body
+
+    def _attack(
+        self, key: Array, scene: physics.Scene, body: physics.State
+    ) -> physics.State:
+        """The box on its way to the character, one face ahead."""
+        side_key, aim_key, speed_key = jax.random.split(key, 3)
+        side = jax.random.uniform(side_key, minval=-jnp.pi, maxval=jnp.pi)
+        aim = jax.random.uniform(
+            aim_key, minval=-self.off_centre, maxval=self.off_centre
+        )
+        slow, fast = self.speed
+        speed = jax.random.uniform(speed_key, minval=slow, maxval=fast)
+        away = partner.direction(side)
+        across = jnp.stack([-away[1], away[0]])
+        root = scene.character_qpos(body.qpos)[:2]
+        place = jnp.append(root + self.distance * away + aim * across, side)
+        adr, dof = _address(scene, self.opponent)
+        return dataclasses.replace(
+            body,
+            qpos=body.qpos.at[adr : adr + 3].set(place),
+            qvel=body.qvel.at[dof : dof + 3].set(jnp.append(-speed * away, 0.0)),
+            qacc=body.qacc.at[dof : dof + 3].set(0.0),
+        )
+
+    def _retreat(
+        self, scene: physics.Scene, state: State, body: physics.State
+    ) -> physics.State:
+        """The box brakes a while after it has bumped, so that it does not lean on."""
+        bumped = (state.touched > self.let_go) & (state.touched < NEVER)
+        slower = jnp.where(bumped, math.exp(-CONTROL_DT / self.brake_time), 1.0)
+        _, dof = _address(scene, self.opponent)
+        qvel = body.qvel.at[dof : dof + 3].multiply(slower)
+        return dataclasses.replace(body, qvel=qvel)
+
+    def root_target(
+        self, scene: physics.Scene, state: State, start: RootTarget, time: Array
+    ) -> RootTarget:
+        """On its path."""
+        position, heading, speed = partner.path(state.motion, time)
+        return RootTarget(position, speed * partner.direction(heading))
+
+    def forces(
+        self,
+        scene: physics.Scene,
+        state: State,
+        kin: physics.Kinematics,
+        solution: physics.Solution,
+        action: Array,
+    ) -> tuple[State, Forces]:
+        """The contacts of the opponent, one resultant a body, F = 4."""
+        bodies = [scene.body(self.prefix + name) for name in BODIES]
+        sums = [self._bump(scene, solution, body) for body in bodies]
+        force = jnp.stack([f for f, _ in sums])
+        total = jnp.sum(force, axis=0)
+        size = jnp.sqrt(jnp.sum(jnp.square(total)) + 1e-12)
+        touches = jnp.any(force != 0.0)
+        first = touches & (state.touched >= NEVER)
+        later = jnp.where(state.touched < NEVER, state.touched + scene.timestep, NEVER)
+        state = dataclasses.replace(
+            state,
+            touched=jnp.where(first, 0.0, later),
+            impulse=state.impulse + scene.timestep * total,
+            force_peak=jnp.maximum(state.force_peak, size),
+        )
+        return state, Forces(
+            force_w=force,
+            point_w=jnp.stack([p for _, p in sums]),
+            body=jnp.array(bodies),
+            gate=jnp.ones((), bool),
+        )
+
+    def _bump(
+        self, scene: physics.Scene, solution: physics.Solution, body: int
+    ) -> tuple[Array, Array]:
+        """The opponent's force [3] on a body, and its point [3]."""
+        slots, sign = opponent_contacts(scene, body, self.opponent)
+        force = sign[:, None] * solution.contact_force_w[slots]
+        return resultant(force, solution.contact_point_w[slots])
+
+    def observe(self, scene: physics.Scene, state: State, body: physics.State) -> Array:
+        """Where the opponent is and how it moves [4], relative to the character."""
+        q, qd = scene.character_qpos(body.qpos), scene.character_qvel(body.qvel)
+        adr, dof = _address(scene, self.opponent)
+        offset = body.qpos[adr : adr + 2] - q[:2]
+        velocity = body.qvel[dof : dof + 2] - qd[:2]
+        _, facing = features.local_frame(q)
+        seen = jnp.pad(jnp.stack([offset, velocity]), ((0, 0), (0, 1)))
+        return quat.rotate(quat.inv(facing), seen)[:, :2].reshape(-1)
+
+    def evaluate(
+        self, scene: physics.Scene, state: State, body: physics.State
+    ) -> dict[str, Array]:
+        """Of a control step: the opponent's impulse (N s) and largest force (N), how
+        far the root is from the reference's and the opponent (m), and the time since
+        the bump began (s)."""
+        q = scene.character_qpos(body.qpos)
+        root, _, _ = partner.path(state.motion, state.motion.time + CONTROL_DT)
+        adr, _ = _address(scene, self.opponent)
+        return {
+            "bump_impulse": _length(state.impulse),
+            "bump_force_peak": state.force_peak,
+            "path_distance": _length(q[:2] - root),
+            "opponent_distance": _length(q[:2] - body.qpos[adr : adr + 2]),
+            "since_bump": state.touched,
+        }
+
+
+def opponent_contacts(
+    scene: physics.Scene, body: int, opponent: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Contact slots of a body with the opponent, and the force's sign on the body."""
+    model = scene.model
+    rival = model.body_rootid[model.jnt_bodyid[model.joint(opponent).id]]
+    first, second = scene.contact_bodies.T
+    first_hit = (first == body) & (model.body_rootid[second] == rival)
+    second_hit = (second == body) & (model.body_rootid[first] == rival)
+    slots = np.flatnonzero(first_hit | second_hit)
+    return slots, np.where(second_hit[slots], 1.0, -1.0)
+
+
+def _address(scene: physics.Scene, joint: str) -> tuple[int, int]:
+    """Where a joint begins in qpos and in qvel."""
+    found = scene.model.joint(joint)
+    return int(found.qposadr[0]), int(found.dofadr[0])
+
+
+def _length(vector: Array) -> Array:
+    return jnp.sqrt(jnp.sum(jnp.square(vector)) + 1e-12)
