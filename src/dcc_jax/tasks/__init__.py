@@ -9,7 +9,9 @@ from dcc_jax.env.environment import EnvConfig, Environment
 from dcc_jax.env.task import Task
 from dcc_jax.motion.clip import Clip, load_clip
 from dcc_jax.motion.reference import make_references
+from dcc_jax.tasks.ball import Ball
 from dcc_jax.tasks.chicken_fight import ChickenFight
+from dcc_jax.tasks.door import Door
 from dcc_jax.tasks.hand_in_hand import HandInHand
 from dcc_jax.tasks.push import Push
 from dcc_jax.tasks.trampoline import Trampoline
@@ -18,7 +20,7 @@ if TYPE_CHECKING:
     from dcc_jax.config import Config
 
 TASKS: dict[str, type[Task]] = {
-    task.name: task for task in (Push, Trampoline, HandInHand, ChickenFight)
+    task.name: task for task in (Push, Trampoline, HandInHand, ChickenFight, Door, Ball)
 }
 
 

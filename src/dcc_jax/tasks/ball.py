@@ -1,0 +1,245 @@
+"""Balancing a ball on the head (Sec. 5.4): an inverted pendulum on a cart that walks.
+
+A pole pivots on the crown and carries a ball at its tip; now and then the ball is
+pushed. Six more actions are fictional forces at the head and at the root. They do not
+act in the simulation: the compliance alone hears them, so that the policy can deform
+the body, and move it, without leaving its reference.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import mujoco
+
+from dcc_jax import physics, quat
+from dcc_jax.env import features
+from dcc_jax.env.task import Forces, Task, place_character
+from dcc_jax.motion.reference import RefState
+
+Array = jax.Array
+
+CROWN = (0.02, 0.0, 0.245)  # m, in the head's frame: the top of its sphere
+HEAD_CENTRE = (0.02, 0.0, 0.14)  # m, likewise
+POLE_RADIUS = 0.012  # m
+
+
+@flax.struct.dataclass
+class State:
+    """When the ball is pushed next."""
+
+    next_push: Array  # [] s until then
+
+
+@dataclass(frozen=True)
+class Ball(Task):
+    """Keep the ball above the head, and step where that takes a step.
+
+    Raises:
+        ValueError: a number that makes no pole, no ball or no push.
+    """
+
+    name: ClassVar[str] = "ball"
+    clips: ClassVar[tuple[str, ...]] = (
+        "stand",
+        "balance",
+        *(f"recover_{angle:03d}" for angle in range(0, 360, 45)),
+    )
+    has_reward: ClassVar[bool] = True
+    extra_actions: ClassVar[int] = 6
+    state_size: ClassVar[int] = 12
+
+    pole_length: float = 0.7
+    """m from the pivot to the middle of the ball."""
+    pole_mass: float = 0.2
+    """kg, spread along the pole."""
+    ball_radius: float = 0.12
+    """m, of a basketball."""
+    ball_mass: float = 0.6
+    """kg, likewise."""
+    tilt: float = 0.05
+    """rad, the pole leans by up to this in x and in y at the reset."""
+    interval: float = 2.0
+    """s between two pushes."""
+    push: tuple[float, float] = (0.1, 0.3)
+    """m/s, what a push adds to the ball's velocity, in any horizontal direction."""
+    dropped: float = 0.8
+    """rad; with the pole leaning more than this the ball is lost."""
+    head_force: float = 1000.0
+    """N of fictional force at the head for an action of 1; 0 takes it away. At alpha =
+    0.16 it takes the head of the standing character 0.13 m/s sideways or ahead."""
+    root_force: float = 10000.0
+    """N at the root, likewise; 0.12 m/s."""
+
+    def __post_init__(self) -> None:
+        positive = ("pole_length", "pole_mass", "ball_radius", "ball_mass", "interval")
+        for name in positive:
+            value = getattr(self, name)
+            if not 0.0 < value < math.inf:
+                raise ValueError(f"ball.{name} must be positive, got {value}")
+        for name in ("tilt", "head_force", "root_force"):
+            value = getattr(self, name)
+            if not 0.0 <= value < math.inf:
+                raise ValueError(f"ball.{name} must be 0 or more, got {value}")
+
+    def extend(self, spec: mujoco.MjSpec) -> None:
+        """Pole and ball, and the ball joint that stands them on the crown."""
+        pole = spec.worldbody.add_body(name="pole", pos=[0.0, 0.0, 2.0])
+        pole.add_freejoint(name="pole")
+        rod = pole.add_geom(
+            name="pole",
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+            fromto=[0.0, 0.0, 0.0, 0.0, 0.0, self.pole_length],
+            size=[POLE_RADIUS, 0, 0],
+            mass=self.pole_mass,
+            rgba=[0.45, 0.38, 0.30, 1.0],
+        )
+        ball = pole.add_geom(
+            name="ball",
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            pos=[0.0, 0.0, self.pole_length],
+            size=[self.ball_radius, 0, 0],
+            mass=self.ball_mass,
+            rgba=[0.9, 0.45, 0.1, 1.0],
+        )
+        for geom in (rod, ball):
+            geom.contype, geom.conaffinity = 0, 0
+        pole.add_site(name="foot_of_pole")
+        spec.body("head").add_site(name="crown", pos=list(CROWN))
+        spec.add_equality(
+            name="pivot",
+            type=mujoco.mjtEq.mjEQ_CONNECT,
+            objtype=mujoco.mjtObj.mjOBJ_SITE,
+            name1="crown",
+            name2="foot_of_pole",
+        )
+
+    def reset(
+        self, key: Array, scene: physics.Scene, reference: RefState
+    ) -> tuple[State, Array, Array]:
+        """The pole nearly upright, moving along with the head."""
+        lean_key, push_key = jax.random.split(key)
+        qpos, qvel = place_character(scene, reference)
+        lean = jax.random.uniform(lean_key, (2,), minval=-self.tilt, maxval=self.tilt)
+        crown = _on_head(reference.qpos, CROWN)
+        velocity = 30.0 * (crown - _on_head(reference.qpos_previous, CROWN))
+        q_adr, v_adr = _pole(scene)
+        pose = jnp.concatenate([crown, quat.exp(jnp.append(lean, 0.0))])
+        state = State(self.interval * jax.random.uniform(push_key))
+        return (
+            state,
+            qpos.at[q_adr : q_adr + 7].set(pose),
+            qvel.at[v_adr : v_adr + 3].set(velocity),
+        )
+
+    def control_step(
+        self, key: Array, scene: physics.Scene, state: State, body: physics.State
+    ) -> tuple[State, physics.State]:
+        """Pushes the ball when its time has come."""
+        due = state.next_push <= 0.0
+        pushed = self._pushed(key, scene, body)
+        body = body.replace(qvel=jnp.where(due, pushed, body.qvel))
+        waited = jnp.where(due, self.interval, state.next_push)
+        return State(waited - 1.0 / 30.0), body
+
+    def _pushed(self, key: Array, scene: physics.Scene, body: physics.State) -> Array:
+        """Velocities [nv] after an impulse on the ball; the pivot stays as it moves."""
+        side_key, speed_key = jax.random.split(key)
+        side = jax.random.uniform(side_key, minval=-jnp.pi, maxval=jnp.pi)
+        speed = jax.random.uniform(speed_key, minval=self.push[0], maxval=self.push[1])
+        change_w = speed * jnp.stack([jnp.cos(side), jnp.sin(side), jnp.zeros(())])
+        q_adr, v_adr = _pole(scene)
+        change = quat.rotate(quat.inv(body.qpos[q_adr + 3 : q_adr + 7]), change_w)
+        # omega x r = change, for r along the pole's own z axis.
+        turn = jnp.stack([-change[1], change[0], jnp.zeros(())]) / self.pole_length
+        return body.qvel.at[v_adr + 3 : v_adr + 6].add(turn)
+
+    def forces(
+        self,
+        scene: physics.Scene,
+        state: State,
+        kin: physics.Kinematics,
+        solution: physics.Solution,
+        action: Array,
+    ) -> tuple[State, Forces]:
+        """The fictional forces at head and root, F = 2."""
+        head, root = scene.body("head"), scene.body("pelvis")
+        heading = quat.heading(kin.body_quat[root])
+        scale = jnp.asarray([[self.head_force], [self.root_force]])
+        crown = kin.body_pos[head] + quat.rotate(
+            kin.body_quat[head], jnp.asarray(CROWN)
+        )
+        return state, Forces(
+            force_w=quat.rotate(heading, scale * action[-6:].reshape(2, 3)),
+            point_w=jnp.stack([crown, kin.body_pos[root]]),
+            body=jnp.asarray([head, root]),
+            gate=jnp.ones((), bool),
+        )
+
+    def observe(self, scene: physics.Scene, state: State, body: physics.State) -> Array:
+        """Position and velocity of the ball, then of the middle of the pole [12]."""
+        origin, heading = features.local_frame(scene.character_qpos(body.qpos))
+        to_local = quat.inv(heading)
+        numbers = []
+        for height in (self.pole_length, 0.5 * self.pole_length):
+            position, velocity = _along_pole(scene, body, height)
+            numbers += [position - origin, velocity]
+        return quat.rotate(to_local, jnp.stack(numbers)).reshape(-1)
+
+    def reward(self, scene: physics.Scene, state: State, body: physics.State) -> Array:
+        """r_task = exp(-2 |p_ball - p_head|^2) over the ground."""
+        return jnp.exp(-2.0 * jnp.sum(jnp.square(self._offset(scene, body))))
+
+    def terminated(
+        self, scene: physics.Scene, state: State, body: physics.State
+    ) -> Array:
+        """The ball is lost."""
+        return _upright(scene, body) < math.cos(self.dropped)
+
+    def evaluate(
+        self, scene: physics.Scene, state: State, body: physics.State
+    ) -> dict[str, Array]:
+        """Offset of the ball from the head over the ground in m, lean in rad."""
+        lean = jnp.arccos(jnp.clip(_upright(scene, body), -1.0, 1.0))
+        offset = jnp.sqrt(jnp.sum(jnp.square(self._offset(scene, body))) + 1e-12)
+        return {"offset": offset, "lean": lean}
+
+    def _offset(self, scene: physics.Scene, body: physics.State) -> Array:
+        ball, _ = _along_pole(scene, body, self.pole_length)
+        head = _on_head(scene.character_qpos(body.qpos), HEAD_CENTRE)
+        return (ball - head)[:2]
+
+
+def _pole(scene: physics.Scene) -> tuple[int, int]:
+    joint = scene.model.joint("pole")
+    return int(joint.qposadr[0]), int(joint.dofadr[0])
+
+
+def _on_head(q: Array, offset: tuple[float, float, float]) -> Array:
+    """World position [3] of a point of the head at the character's coordinates [55]."""
+    pos_w, quat_w = features.body_pose(q, "head")
+    return pos_w + quat.rotate(quat_w, jnp.asarray(offset))
+
+
+def _along_pole(
+    scene: physics.Scene, body: physics.State, height: float
+) -> tuple[Array, Array]:
+    """World position [3] and velocity [3] of the point at a height of the pole."""
+    q_adr, v_adr = _pole(scene)
+    foot, turn = body.qpos[q_adr : q_adr + 3], body.qpos[q_adr + 3 : q_adr + 7]
+    linear, angular = body.qvel[v_adr : v_adr + 3], body.qvel[v_adr + 3 : v_adr + 6]
+    point = jnp.array([0.0, 0.0, height])
+    swing = quat.rotate(turn, jnp.cross(angular, point))
+    return foot + quat.rotate(turn, point), linear + swing
+
+
+def _upright(scene: physics.Scene, body: physics.State) -> Array:
+    """Cosine of the pole's angle from the vertical."""
+    q_adr, _ = _pole(scene)
+    up = jnp.array([0.0, 0.0, 1.0])
+    return quat.rotate(body.qpos[q_adr + 3 : q_adr + 7], up)[2]
