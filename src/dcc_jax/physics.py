@@ -307,10 +307,11 @@ def point_jacobian(scene: Scene, kin: Kinematics, point_w: Array, body: Array) -
 
 
 def mass_solve(scene: Scene, kin: Kinematics, qfrc: Array) -> Array:
-    """M^-1 qfrc [nv] with the true mass matrix (no h*kv).
+    """M^-1 qfrc with the true mass matrix (no h*kv), for qfrc [nv] or [F, nv].
 
     With qfrc = J^T f this is FD(q, qd, f) - FD(q, qd, 0) of Alg. 1, because forward
     dynamics is linear in the external force.
     """
     mass = mjx.full_m(scene.mjx_model, kin.data) - jnp.diag(scene.spd_diagonal)
-    return solve_mass(scene.arrow, mass, qfrc)
+    solved = solve_mass(scene.arrow, mass, jnp.atleast_2d(qfrc))
+    return solved.reshape(qfrc.shape)

@@ -64,9 +64,9 @@ def newton(
     return solve(mass, smooth, rows.J, rows.D, rows.aref, start)
 
 
-def solve_mass(shape: Arrow, mass: Array, force: Array) -> Array:
-    """M^-1 force, for M [nv, nv] and force [nv]."""
-    return _batch_last(functools.partial(_solve_mass, shape))(mass, force)
+def solve_mass(shape: Arrow, mass: Array, forces: Array) -> Array:
+    """M^-1 f for M [nv, nv] and every f of forces [F, nv]: [F, nv]."""
+    return _batch_last(functools.partial(_solve_mass, shape))(mass, forces.T).T
 
 
 def _batch_last(function: Callable) -> Callable:
@@ -135,7 +135,9 @@ def _newton(
     # once: XLA would compute parts of it again wherever the factorization needs them.
     def iterated(_: int, carry: tuple) -> tuple:
         qacc, residual, mass_qacc, (H, gradient, gauss) = carry
-        search = _solve(shape, H, jax.tree.map(jnp.negative, gradient))
+        downhill = jax.tree.map(lambda g: -g[..., None, :], gradient)
+        search = _solve(shape, H, downhill)
+        search = jax.tree.map(lambda x: x[..., 0, :], search)
         slope = _rows_times(shape, J_parts, search)
         mass_search = _times(shape, M, search)
         step = _line_search(
@@ -158,8 +160,8 @@ def _newton(
     return _joined(shape, qacc), force[back]
 
 
-def _solve_mass(shape: Arrow, mass: Array, force: Array) -> Array:
-    return _joined(shape, _solve(shape, _fronts(shape, mass), _split(shape, force)))
+def _solve_mass(shape: Arrow, mass: Array, forces: Array) -> Array:
+    return _joined(shape, _solve(shape, _fronts(shape, mass), _split(shape, forces)))
 
 
 def _line_search(
@@ -211,7 +213,7 @@ def _split(shape: Arrow, x: Array) -> Split:
 def _joined(shape: Arrow, x: Split) -> Array:
     """The inverse of `_split`, [nv, B]."""
     index = np.concatenate([*(s.dofs.ravel() for s in shape.stacks), shape.core])
-    parts = [part.reshape(-1, part.shape[-1]) for part in x.limbs]
+    parts = [part.reshape(-1, *part.shape[2:]) for part in x.limbs]
     real = index < shape.nv
     back = np.empty(shape.nv, int)
     back[index[real]] = np.flatnonzero(real)
@@ -246,15 +248,20 @@ def _with_core(stack: Stack, limbs: Array, core: Array) -> Array:
     return jnp.concatenate([limbs, _take(core, stack.core)], axis=1)
 
 
-def _add_to_core(stack: Stack, core: Array, parts: Array) -> Array:
-    """core [c, (c,) B] plus what every front [G, k, (k,) B] has for it."""
+def _add_to_core(
+    stack: Stack, core: Array, parts: Array, matrix: bool = False
+) -> Array:
+    """core plus what every limb has for it; core [c, ...] and parts [G, k, ...].
+
+    With `matrix` it is [c, c, B] and [G, k, k, B].
+    """
     for columns, part in zip(stack.core, parts, strict=True):
         real = np.flatnonzero(columns < core.shape[0])
         target = columns[real]
-        if part.ndim == 2:
-            core = core.at[target].add(part[real])
-        else:
+        if matrix:
             core = core.at[target[:, None], target].add(part[real[:, None], real])
+        else:
+            core = core.at[target].add(part[real])
     return core
 
 
@@ -337,56 +344,61 @@ def _outer_sums(
 
 
 def _solve(shape: Arrow, A: Fronts, b: Split) -> Split:
-    """A^-1 b: the limbs are eliminated, then the core is solved, then the limbs."""
+    """A^-1 b for F right sides: parts [..., F, B].
+
+    The limbs are eliminated, then the core is solved, then the limbs.
+    """
     core, core_b = A.core, b.core
     eliminated = []
     for stack, front, limb_b in zip(shape.stacks, A.limbs, b.limbs, strict=True):
-        y = jnp.pad(limb_b, ((0, 0), (0, stack.core.shape[1]), (0, 0)))
+        y = jnp.pad(limb_b, ((0, 0), (0, stack.core.shape[1]), (0, 0), (0, 0)))
         factor, front, y = _eliminate(front, y, limb_b.shape[1])
         eliminated.append(factor)
-        core = _add_to_core(stack, core, front)
+        core = _add_to_core(stack, core, front, matrix=True)
         core_b = _add_to_core(stack, core_b, y)
     factor, _, _ = _eliminate(core[None], core_b[None], core.shape[0])
-    x_core = _substitute(factor, core_b[None, :0])
+    x_core = _substitute(factor, core_b[None, :0])[0]
     limbs = tuple(
-        _substitute(factor, _take(x_core[0], stack.core)[:, : stack.core.shape[1]])
+        _substitute(factor, _take(x_core, stack.core))
         for stack, factor in zip(shape.stacks, eliminated, strict=True)
     )
-    return Split(limbs, x_core[0])
+    return Split(limbs, x_core)
 
 
 def _eliminate(A: Array, b: Array, size: int) -> tuple[list, Array, Array]:
-    """Block elimination of the first `size` unknowns of A x = b.
+    """Block elimination of the first `size` unknowns of A x = b, F right sides.
 
     A [G, m, m, B] is symmetric positive definite, which needs no pivoting.
 
     Returns:
-        per block the coupling [G, BLOCK, rest, B] and right side [G, BLOCK, B] of
-        x_block = right - coupling x_rest, then the Schur complement and its right side.
+        per block the couplings (BLOCK of [G, rest, B]) and right sides (BLOCK of
+        [G, F, B]) of x_i = right_i - coupling_i x_rest, then the Schur complement and
+        its right sides.
     """
     factor = []
     for _ in range(size // BLOCK):
         pivot = [[A[:, i, j] for i in range(BLOCK)] for j in range(BLOCK)]
         panel = [A[:, i, BLOCK:] for i in range(BLOCK)]
         coupling = _solve_3(pivot, panel)
-        right = _solve_3(pivot, [b[:, i, None] for i in range(BLOCK)])
+        right = _solve_3(pivot, [b[:, i] for i in range(BLOCK)])
         A, b = A[:, BLOCK:, BLOCK:], b[:, BLOCK:]
         for p, c, r in zip(panel, coupling, right, strict=True):
             A = A - p[:, :, None] * c[:, None]
-            b = b - p * r
+            b = b - p[:, :, None] * r[:, None]
         factor.append((coupling, right))
     return factor, A, b
 
 
 def _substitute(factor: list, rest: Array) -> Array:
-    """The unknowns [G, m, B] that belong to those of the rest [G, k, B]."""
+    """The unknowns [G, m, F, B] that belong to those of the rest [G, k, F, B]."""
     x = [rest[:, i] for i in range(rest.shape[1])]
+    known = len(x)
     for coupling, right in reversed(factor):
         own = []
         for c, r in zip(coupling, right, strict=True):
-            own.append(r[:, 0] - sum(c[:, j] * value for j, value in enumerate(x)))
+            own.append(r - sum(c[:, j, None] * value for j, value in enumerate(x)))
         x = own + x
-    return jnp.stack(x[: len(x) - rest.shape[1]], axis=1)
+    return jnp.stack(x[: len(x) - known], axis=1)
 
 
 def _solve_3(P: list[list[Array]], y: list[Array]) -> list[Array]:

@@ -91,9 +91,8 @@ def _run(plan: Plan, options: argparse.Namespace) -> None:
         found = report.execute(
             plan, lambda done, total: bar.update(line, completed=done, total=total)
         )
-    table, console = show.table(found), Console()
-    width = max(console.width, console.measure(table).maximum)
-    console.print(table, width=width, soft_wrap=True)
+    # In a file the table is as wide as it likes.
+    Console(width=None if sys.stdout.isatty() else 400).print(show.table(found))
     if options.json is not None:
         options.json.write_text(found.to_json())
         print(f"wrote {options.json}")

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
-from dcc_jax import quat
+from dcc_jax import physics, quat
 from dcc_jax.env import mechanics
 from dcc_jax.env.environment import ALPHA_ENTRY, CONTROL_RATE, Environment, EnvState
 from dcc_jax.env.mechanics import Mechanics
@@ -43,6 +43,8 @@ class Motion:
     reference: Array  # [..., 55] q_m(t), where the task follows its clip in time
     force_w: Array  # [..., F, 3] N, that the compliance hears
     point_w: Array  # [..., F, 3] m
+    mocap_pos: Array  # [..., nmocap, 3] m, of the scene's kinematic bodies
+    mocap_quat: Array  # [..., nmocap, 4]
 
 
 @flax.struct.dataclass
@@ -257,12 +259,17 @@ class Player:
     def _motion(self, state: EnvState, forces: Forces) -> Motion:
         heard = jnp.where(forces.gate[:, None, None], forces.force_w, 0.0)
         strongest = jnp.argmax(jnp.sum(heard**2, axis=(1, 2)))
+        scene = self.environment.scene
+        world = self.environment.task.world(scene, state.task, state.time)
+        world = physics.default_world(scene) if world is None else world
         return Motion(
             qpos=state.body.qpos,
             u=state.displacement.u,
             reference=state.reference.qpos,
             force_w=heard[strongest],
             point_w=forces.point_w[strongest],
+            mocap_pos=world.mocap_pos,
+            mocap_quat=world.mocap_quat,
         )
 
 

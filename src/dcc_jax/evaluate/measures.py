@@ -62,7 +62,10 @@ CURVES = (
 
 
 def rows(
-    recording: Recording, nearest: np.ndarray, contacts: list[list[dict[str, float]]]
+    recording: Recording,
+    nearest: np.ndarray,
+    contacts: list[list[dict[str, float]]],
+    clock: str | None,
 ) -> list[dict[str, float]]:
     """The metrics of each episode.
 
@@ -70,9 +73,11 @@ def rows(
         recording: of N episodes.
         nearest: style distance [C, N] in m at the end of each chunk.
         contacts: of each episode, from `contacts_of`.
+        clock: a number of the task that is no measure of anything.
     """
     return [
-        _row(recording, nearest, contacts[n], n) for n in range(len(recording.fell))
+        _row(recording, nearest, of_episode, n, f"task/{clock}")
+        for n, of_episode in enumerate(contacts)
     ]
 
 
@@ -110,6 +115,7 @@ def _row(
     nearest: np.ndarray,
     contacts: list[dict[str, float]],
     n: int,
+    clock: str,
 ) -> dict[str, float]:
     lasting = int(recording.alive[:, n].sum())
     numbers = {name: x[:lasting, n] for name, x in recording.numbers.items()}
@@ -139,7 +145,7 @@ def _row(
         "r_task": float(numbers["r_task"].mean()),
     }
     for name, values in numbers.items():
-        if name.startswith("task/"):
+        if name.startswith("task/") and name != clock:
             row |= _reduced(name, values)
     return row
 

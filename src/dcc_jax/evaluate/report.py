@@ -224,6 +224,7 @@ class _Part:
 
 
 def _part(player: Player, recording: Recording, condition: Condition) -> _Part:
+    clock = player.environment.task.clock
     clips = jax.jit(lambda: style.make_reference(player.environment))()
     nearest = np.full(recording.pairs_alive.shape, np.nan)
     alive = recording.pairs_alive
@@ -235,10 +236,10 @@ def _part(player: Player, recording: Recording, condition: Condition) -> _Part:
     contacts = [measures.contacts_of(recording, n) for n in range(len(recording.fell))]
     return _Part(
         condition=condition,
-        rows=measures.rows(recording, nearest, contacts),
+        rows=measures.rows(recording, nearest, contacts, clock),
         contacts=contacts,
         pooled={"style/frechet": frechet, "broken": float(recording.nan.sum())},
-        curves=measures.curves(recording, player.environment.task.clock),
+        curves=measures.curves(recording, clock),
         survival=measures.survival(recording),
     )
 

@@ -26,7 +26,7 @@ COMPARED = (
     "style/nearest",
 )
 """Metrics whose ratios are drawn; the first and the fourth are Fig. 4."""
-NO_RATIO = ("fell", "u/", "contact/energy", "energy", "range", "task/")
+NO_RATIO = ("fell", "u/", "contact/energy", "contact/foot", "energy", "range", "task/")
 """Metrics that may be zero or of either sign: differences are shown."""
 COLUMNS = 3
 
@@ -36,9 +36,9 @@ def table(report: Report) -> Table:
     page = Table(title=f"{_title(report)}; means [95 % interval]", title_justify="left")
     page.add_column("", no_wrap=True)
     for i, _ in enumerate(report.conditions):
-        page.add_column(_name(report, i), justify="right", no_wrap=True)
+        page.add_column(_name(report, i), justify="right")
     for comparison in report.comparisons:
-        page.add_column(_versus(report, comparison), justify="right", no_wrap=True)
+        page.add_column(_versus(report, comparison), justify="right")
     known = METRICS | POOLED
     for name in report.summary[0]:
         unit = known[name][0] if name in known else ""
@@ -159,11 +159,7 @@ def _compared(comparison: Comparison, name: str) -> str:
     """The ratio of means, or the difference where a ratio says nothing."""
     if name not in comparison.ratio:
         return ""
-    if (
-        name == "fell"
-        or name.startswith("task/")
-        or name in ("contact/energy", "energy")
-    ):
+    if name.startswith(NO_RATIO):
         return f"diff {_text(comparison.difference[name])}"
     return _text(comparison.ratio[name])
 

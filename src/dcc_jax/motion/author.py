@@ -8,10 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from dcc_jax.motion import author_door, author_gaits, author_jumps, author_stand
+from dcc_jax.motion import (
+    author_door,
+    author_gaits,
+    author_hop,
+    author_jumps,
+    author_run,
+    author_stand,
+)
 from dcc_jax.motion.author_dynamics import Solved
 from dcc_jax.motion.author_jumps import Jump
 from dcc_jax.motion.author_style import FPS, RATE
@@ -41,6 +49,14 @@ def _recoveries() -> dict[str, Recipe]:
     }
 
 
+def _turning(name: str, make: Callable[..., Solved], turn: float) -> dict[str, Recipe]:
+    """A gait straight ahead, to the left and to the right by `turn` rad a step."""
+    turns = {name: 0.0, f"{name}_left": turn, f"{name}_right": -turn}
+    return {
+        key: Recipe(partial(make, turn=angle), name) for key, angle in turns.items()
+    }
+
+
 RECIPES: dict[str, Recipe] = {
     "stand": Recipe(author_stand.stand, "stand", loop=True),
     **_recoveries(),
@@ -61,13 +77,19 @@ RECIPES: dict[str, Recipe] = {
         "jump",
     ),
     "backflip": Recipe(author_jumps.backflip, "backflip"),
-    "walk": Recipe(author_gaits.walk, "walk"),
-    "walk_left": Recipe(lambda: author_gaits.walk(turn=0.20), "walk"),
-    "walk_right": Recipe(lambda: author_gaits.walk(turn=-0.20), "walk"),
+    **_turning("walk", author_gaits.walk, 0.20),
+    "walk_slow_cycle": Recipe(
+        lambda: author_gaits.walk_cycle(author_gaits.SLOW), "walk", loop=True
+    ),
     "walk_cycle": Recipe(author_gaits.walk_cycle, "walk", loop=True),
-    "run": Recipe(author_gaits.run, "run"),
-    "run_cycle": Recipe(author_gaits.run_cycle, "run", loop=True),
-    "hop": Recipe(author_gaits.hop, "hop"),
+    "walk_fast_cycle": Recipe(
+        lambda: author_gaits.walk_cycle(author_gaits.FAST), "walk", loop=True
+    ),
+    **_turning("jog", partial(author_run.run, author_run.JOG), 0.18),
+    "jog_cycle": Recipe(lambda: author_run.run_cycle(author_run.JOG), "jog", loop=True),
+    **_turning("run", author_run.run, 0.15),
+    "run_cycle": Recipe(author_run.run_cycle, "run", loop=True),
+    "hop": Recipe(author_hop.hop, "hop"),
     "door": Recipe(author_door.open_door, "door", phase=True),
 }
 """Every clip of ours; the recovery directions are degrees, 0 ahead, 90 left."""
@@ -97,7 +119,7 @@ def as_clip(solved: Solved, name: str, recipe: Recipe) -> Clip:
         qpos = _closed(qpos)
     phase = np.linspace(0.0, 1.0, len(qpos), dtype=np.float32)
     return Clip(
-        qpos=np.round(qpos, DECIMALS).astype(np.float32),
+        qpos=(np.round(qpos, DECIMALS) + 0.0).astype(np.float32),  # and no -0.0
         fps=float(FPS),
         name=name,
         source=SOURCE,

@@ -12,16 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solve_banded
-from scipy.ndimage import (
-    distance_transform_edt,
-    gaussian_filter1d,
-    maximum_filter1d,
-)
+from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 from scipy.sparse import coo_array, diags_array, eye_array, kron, vstack
 from scipy.sparse.linalg import spsolve
 
 from dcc_jax.motion.author_kinematics import (
     GRAVITY,
+    HIPS,
     RIGHT_ELBOW,
     RIGHT_SHOULDER,
     SHIN,
@@ -41,8 +38,12 @@ from dcc_jax.motion.author_steps import FootTrack
 
 RIGHT_ARM = [RIGHT_SHOULDER, RIGHT_ELBOW]
 ELBOW_DOWN = np.array([-0.2, -0.5, -1.0])  # where the elbow of a reaching arm points
+NEAR = 0.20  # s before and after a flight in which the pelvis may turn ...
+LEVER = 0.06  # m, ... for the weight to act no farther than this from the middle
+LOWER_TIME = 0.2  # s, over which the body sinks to reach a foothold
+EASE = 0.012  # m, over which the reach of a swinging leg fades out
 ANKLE_EASE = np.array([0.25, 0.60, 0.25])  # rad, a swinging ankle gives way beyond
-SOFT_REACH = 0.985 * (THIGH + SHIN)
+SOFT_REACH = 0.990 * (THIGH + SHIN)  # knees bend by 16 degrees at least
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +89,7 @@ class Solved:
     distance: np.ndarray  # [T, 2] m, from hips to ankles
 
 
-def solve(plan: Plan, rounds: int = 6) -> Solved:
+def solve(plan: Plan, rounds: int = 12) -> Solved:
     """The motion of a plan: pressure where planned, no external moment in flight."""
     turn = np.zeros((len(plan.height), 3))
     spin_rate = np.zeros_like(turn)
@@ -97,7 +98,7 @@ def solve(plan: Plan, rounds: int = 6) -> Solved:
     solved = place(plan, turn, path, root)
     for _ in range(rounds):
         if plan.flight.any():
-            turn = turn + conserving_turn(solved.momentum, plan)
+            turn = turn + conserving_turn(solved.momentum, plan, turn)
         if plan.adapt:
             plan = replace(plan, height=plan.height - lack_of_reach(solved))
         solved = place(plan, turn, path, solved.pose.root)
@@ -107,21 +108,29 @@ def solve(plan: Plan, rounds: int = 6) -> Solved:
 
 
 def lack_of_reach(solved: Solved) -> np.ndarray:
-    """How much lower [T] (m) the body has to be for the knees to stay soft.
+    """How much lower [T] (m) the body has to be for standing knees to stay soft.
 
-    One value from the first to the last flight, which have to stay ballistic.
+    The w >= lack of length with the least sum of w^2 + LOWER_TIME^4 w''^2, straight in
+    flight, which has to stay ballistic; found by guessing where the bound is active.
     """
-    dt, flight = solved.plan.dt, np.flatnonzero(solved.plan.flight)
-    need = np.maximum(solved.distance - SOFT_REACH, 0.0).max(1)
-    lack = maximum_filter1d(need, round(0.25 / dt), mode="nearest")
-    lack = gaussian_filter1d(lack, 0.10 / dt, mode="nearest")
-    if len(flight) == 0:
-        return lack
-    margin = round(0.45 / dt)
-    airborne = np.zeros(len(need))
-    airborne[max(flight[0] - margin, 0) : flight[-1] + margin] = 1.0
-    airborne = gaussian_filter1d(airborne, 0.1 / dt, mode="nearest", truncate=4.0)
-    return airborne * need.max() + (1.0 - airborne) * lack
+    plan = solved.plan
+    standing = np.stack([foot.contact for foot in plan.feet], 1)
+    need = (standing * np.maximum(solved.distance - SOFT_REACH, 0.0)).max(1)
+    frames = len(need)
+    stiff = (LOWER_TIME / plan.dt) ** 2 * np.where(plan.flight[1:-1], 100.0, 1.0)
+    second = diags_array(
+        [stiff, -2.0 * stiff, stiff], offsets=[0, 1, 2], shape=(frames - 2, frames)
+    )
+    system = (second.T @ second + eye_array(frames)).tocsc()
+    active = need > 0.0
+    for _ in range(100):
+        bound = diags_array(np.where(active, 1e8, 0.0))
+        lower = spsolve((system + bound).tocsc(), bound @ need)
+        guess = np.where(active, system @ lower > 0.0, lower < need - 1e-9)
+        if (guess == active).all():
+            break
+        active = guess
+    return lower
 
 
 def com_path(plan: Plan, spin_rate: np.ndarray) -> np.ndarray:
@@ -180,6 +189,7 @@ def _posed(plan: Plan, pelvis: np.ndarray, root: np.ndarray) -> tuple[Pose, np.n
         drawn = root[:, None] + apply(pelvis[:, None], plan.tuck)
         ankles = ankles + plan.tucked[..., None] * (drawn - ankles)
         feet = _blend(feet, pelvis[:, None], plan.tucked)
+    ankles = _drawn_in(ankles, root[:, None] + apply(pelvis[:, None], HIPS), plan)
     forward = pelvis[:, None, :, 0] + 0.5 * _foot_headings(plan)
     legs, distance = leg_joints(root, pelvis, ankles, feet, forward)
     for ankle, foot in zip((2, 5), plan.feet, strict=True):
@@ -191,6 +201,21 @@ def _posed(plan: Plan, pelvis: np.ndarray, root: np.ndarray) -> tuple[Pose, np.n
         share = np.stack([plan.grasp, plan.grasp], 1)
         pose.joints[:, RIGHT_ARM] = _blend(hanging, reaching, share)
     return pose, distance
+
+
+def _drawn_in(ankles: np.ndarray, hips: np.ndarray, plan: Plan) -> np.ndarray:
+    """Ankles [T, 2, 3] with those of swinging feet softly kept within reach."""
+    away = ankles - hips
+    distance = np.linalg.norm(away, axis=-1)
+    within = SOFT_REACH - EASE * np.logaddexp(0.0, (SOFT_REACH - distance) / EASE)
+    share = np.stack([_freedom(foot.contact, plan.dt, 0.06) for foot in plan.feet], 1)
+    scale = 1.0 + share * (np.minimum(within / distance, 1.0) - 1.0)
+    return hips + scale[..., None] * away
+
+
+def _freedom(contact: np.ndarray, dt: float, ease: float) -> np.ndarray:
+    """[T] 0 on the ground, 1 when the foot is more than `ease` s away from it."""
+    return np.minimum(distance_transform_edt(~contact) * dt / ease, 1.0)
 
 
 def _foot_headings(plan: Plan) -> np.ndarray:
@@ -207,8 +232,7 @@ def _relaxed(ankle: np.ndarray, contact: np.ndarray, dt: float) -> np.ndarray:
     eased = np.sign(vector) * (
         ANKLE_EASE + 0.2 * np.tanh(np.maximum(beyond, 0.0) / 0.2)
     )
-    share = np.minimum(distance_transform_edt(~contact) * dt / 0.08, 1.0)
-    share = share[:, None] * (beyond > 0.0)
+    share = _freedom(contact, dt, 0.08)[:, None] * (beyond > 0.0)
     return rotation(vector + share * (eased - vector))
 
 
@@ -217,31 +241,31 @@ def _blend(begin: np.ndarray, end: np.ndarray, share: np.ndarray) -> np.ndarray:
     return begin @ rotation(share[..., None] * step)
 
 
-def conserving_turn(state: Momentum, plan: Plan) -> np.ndarray:
-    """Small rotation [T, 3] of the pelvis that makes the momentum constant in flight.
+def conserving_turn(state: Momentum, plan: Plan, turn: np.ndarray) -> np.ndarray:
+    """Small rotation [T, 3] of the pelvis that leaves no more moment than there can be.
 
-    Least squares: in flight the rate of L + I turn' is zero; elsewhere, and in between,
-    the turn is small and smooth.
+    Least squares: the rate of L + I turn' is zero in flight and, close to a flight,
+    small against the weight carried times `LEVER`; the turn is small and smooth.
     """
     frames, dt = len(plan.height), plan.dt
-    flight = plan.flight
-    inner = np.flatnonzero(flight[:-1] & flight[1:])
+    away = distance_transform_edt(~plan.flight) * dt
+    close = away < NEAR
     step = diags_array([-np.ones(frames), np.ones(frames - 1)], offsets=[0, 1]) / dt
     rate = kron(step.tocsr()[:-1], eye_array(3)).tocsr()
     middle = 0.5 * (state.inertia[1:] + state.inertia[:-1])
     blocks = _block_diagonal(middle) @ rate
-    change = np.diff(inner) == 1
-    pairs = np.flatnonzero(change)
-    rows = (3 * inner[pairs][:, None] + np.arange(3)).ravel()
-    after = (3 * inner[pairs + 1][:, None] + np.arange(3)).ravel()
+    inner = np.flatnonzero(close[1:-1]) + 1
+    before = (3 * (inner - 1)[:, None] + np.arange(3)).ravel()
     spin = 0.5 * (state.angular[1:] + state.angular[:-1]).ravel()
-    hold = (blocks[after] - blocks[rows]) / dt
-    want = -(spin[after] - spin[rows]) / dt
+    force = body().mass.sum() * vertical_force(plan.height, dt)[inner]
+    weight = np.repeat((1.0 - away[inner] / NEAR) / (0.2 + LEVER * force), 3)
+    hold = diags_array(weight) @ (blocks[before + 3] - blocks[before]) / dt
+    want = -weight * (spin[before + 3] - spin[before]) / dt
     second = kron((step.T @ step).tocsr()[1:-1], eye_array(3))
-    small = np.where(flight, 1.0, 30.0)
-    keep = diags_array(np.repeat(small, 3))
-    system = vstack([5.0 * hold, 0.02 * second, keep]).tocsr()
-    right = np.concatenate([5.0 * want, np.zeros(second.shape[0] + 3 * frames)])
+    keep = np.interp(away, [0.0, NEAR], [10.0, 30.0])
+    system = vstack([hold, 0.02 * second, diags_array(np.repeat(keep, 3))]).tocsr()
+    back = -(np.where(plan.flight, 0.0, keep)[:, None] * turn).ravel()
+    right = np.concatenate([want, np.zeros(second.shape[0]), back])
     answer = spsolve((system.T @ system).tocsc(), system.T @ right)
     return answer.reshape(frames, 3)
 

@@ -9,7 +9,7 @@ import numpy as np
 from dcc_jax.motion.author_dynamics import Plan, Solved, solve
 from dcc_jax.motion.author_kinematics import GRAVITY, about
 from dcc_jax.motion.author_stand import home
-from dcc_jax.motion.author_steps import Foothold, foot_track, ramp
+from dcc_jax.motion.author_steps import Foothold, brisk, foot_track
 from dcc_jax.motion.author_style import (
     RATE,
     arms,
@@ -33,8 +33,8 @@ class Jump:
 
 CROUCH = 0.24  # m, depth of the wind-up below the stand
 ABSORB = 0.26  # m, depth of the landing
-TAKE_OFF = 0.055  # m above the stand when the toes leave
-TOUCH_DOWN = 0.035  # m above the stand when they land again
+TAKE_OFF = 0.095  # m above the stand when the toes leave
+TOUCH_DOWN = 0.06  # m above the stand when they land again
 WIND_UP, PUSH_OFF = 0.55, 0.30  # s
 LAND, RISE = 0.28, 0.60  # s, down into the landing, up from it
 STAY = 0.12  # s, in the deep of the landing, before the next wind-up or the rise
@@ -84,10 +84,10 @@ def jumps(series: list[Jump], lead_in: float = 0.5, lead_out: float = 0.8) -> So
             holds[side][-1] = replace(
                 holds[side][-1],
                 lift=leave,
-                push=0.75,
+                push=0.65,
                 peel=0.16,
                 shed=0.02,
-                clearance=jump.rise - 0.02,
+                clearance=jump.rise + 0.02,
                 snap=1.5,
             )
             holds[side].append(_landing(side, place, land))
@@ -151,7 +151,7 @@ def _two_footed(
     return Plan(1.0 / RATE, feet, height, pelvis, upper, adapt=False)
 
 
-def backflip(rise: float = 0.52, back: float = 0.35) -> Solved:
+def backflip(rise: float = 0.52, back: float = 0.60) -> Solved:
     """A standing tucked backflip that lands `back` m behind its start."""
     top = stand_height()
     begin, crouch = 0.5, 1.05
@@ -175,16 +175,17 @@ def backflip(rise: float = 0.52, back: float = 0.35) -> Solved:
     lean = [
         (begin, 0.03),
         (crouch, 0.50),
-        (leave - 0.14, 0.10),
-        (leave, -0.40),
-        (leave + 0.10, -1.1),
-        (air, 0.45 - 0.5 * turn),
+        (leave - 0.14, 0.20),
+        (leave, -0.30),
+        (leave + 0.10, -0.8),
+        (air, 0.25 - 0.5 * turn),
         (land - 0.12, 0.95 - turn),
-        (land, 0.35 - turn),
-        (low, 0.55 - turn),
+        (land, 0.50 - turn),
+        (land + 0.12, 0.45 - turn),
+        (low, 0.50 - turn),
         (end, 0.03 - turn),
     ]
-    bend = [(begin, 0.02), (crouch, 0.30), (leave, -0.20), (leave + 0.2, 0.45)]
+    bend = [(begin, 0.02), (crouch, 0.30), (leave, -0.40), (leave + 0.2, 0.45)]
     bend += [(land - 0.2, 0.40), (land, 0.15), (low, 0.35), (end, 0.02)]
     swing = [(begin, 0.05), (crouch, -0.85), (leave, 2.6), (leave + 0.25, 0.95)]
     swing += [(land - 0.2, 0.9), (land, 1.0), (low, 0.7), (end, 0.05)]
@@ -199,11 +200,11 @@ def backflip(rise: float = 0.52, back: float = 0.35) -> Solved:
         holds[side].extend([first, last])
     t = times(end + 0.7)
     plan = _two_footed(t, holds, height_path(t, height), lean, bend, swing, flex)
-    drawn = ramp(t, leave, leave + 0.24) * (1.0 - ramp(t, land - 0.26, land))
+    drawn = brisk(t, leave, leave + 0.28) * (1.0 - brisk(t, land - 0.26, land))
     tuck = np.array([[0.20, side * 0.10, -0.40] for side in (1.0, -1.0)])
     plan = replace(
         plan,
         tuck=np.tile(tuck, (len(t), 1, 1)),
         tucked=np.stack([drawn, drawn], 1),
     )
-    return solve(plan, rounds=12)
+    return solve(plan)

@@ -17,7 +17,7 @@ from dcc_jax.character import JOINTS, load_character
 
 GRAVITY = 9.81  # m/s^2, MuJoCo's default
 THIGH, SHIN = 0.4, 0.4  # m, assets/character.xml
-LEG_REACH = 0.9995 * (THIGH + SHIN)
+HIPS = np.array([[0.0, 0.085, -0.06], [0.0, -0.085, -0.06]])  # m, in the pelvis
 UPPER_ARM, PALM = 0.28, 0.325  # m, shoulder to elbow, elbow to middle of the hand
 SPINE, NECK, LEFT_SHOULDER, LEFT_ELBOW, RIGHT_SHOULDER, RIGHT_ELBOW = range(6)
 LEGS = ((6, 7, 8), (9, 10, 11))  # hip, knee, ankle of the left and the right leg

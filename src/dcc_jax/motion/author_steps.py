@@ -31,6 +31,12 @@ def ramp(t: np.ndarray, start: float, stop: float) -> np.ndarray:
     return smoothstep((t - start) / max(stop - start, 1e-9))
 
 
+def brisk(t: np.ndarray, start: float, stop: float) -> np.ndarray:
+    """As `ramp`, but at once under way: only the rate is zero at both ends."""
+    s = np.clip((t - start) / (stop - start), 0.0, 1.0)
+    return s**2 * (3.0 - 2.0 * s)
+
+
 def quintic(
     s: np.ndarray,
     span: float,

@@ -22,7 +22,7 @@ from dcc_jax.motion.author_steps import Foothold, FootTrack, foot_track, quintic
 RATE = 60  # Hz of the planning; the clips keep every second frame
 FPS = 30
 HIP_WIDTH = 0.085  # m, half the distance of the hips
-STAND_PELVIS = 0.915  # m, knees softly bent
+STAND_PELVIS = 0.926  # m, knees softly bent
 
 
 @dataclass(frozen=True)
