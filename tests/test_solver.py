@@ -70,11 +70,10 @@ def test_every_unknown_and_every_row_has_one_place(shape):
 
 def test_mass_solve_is_the_dense_one(shape):
     p = _problem(shape, 0)
+    forces = np.stack([p["smooth"], p["start"]], axis=1)
     solve = jax.jit(jax.vmap(lambda m, f: solver.solve_mass(shape, m, f)))
-    x = solve(
-        jnp.asarray(p["mass"], jnp.float32), jnp.asarray(p["smooth"], jnp.float32)
-    )
-    dense = np.linalg.solve(p["mass"], p["smooth"][..., None])[..., 0]
+    x = solve(jnp.asarray(p["mass"], jnp.float32), jnp.asarray(forces, jnp.float32))
+    dense = np.linalg.solve(p["mass"], forces.swapaxes(1, 2)).swapaxes(1, 2)
     np.testing.assert_allclose(x, dense, atol=2e-6)
 
 
