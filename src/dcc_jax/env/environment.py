@@ -228,7 +228,7 @@ class Environment:
             time=zero,
             task=task,
         )
-        return self._observed(state)
+        return self.observed(state)
 
     def step(self, key: Array, state: EnvState, action: Array) -> EnvState:
         """One control step.
@@ -286,7 +286,7 @@ class Environment:
                 end.displacement.u,
             ),
         )
-        return _contained(self._judged(self._observed(new)), state)
+        return _contained(self._judged(self.observed(new)), state)
 
     def expert_pairs(self, key: Array, n: int) -> tuple[Array, Array, Array]:
         """(s, s') ~ M: features [n, 270] twice, and the condition [n, 0]."""
@@ -434,7 +434,7 @@ class Environment:
             self.return_stiffness,
         )
 
-    def _observed(self, state: EnvState) -> EnvState:
+    def observed(self, state: EnvState) -> EnvState:
         """Fills in the features and the observation."""
         q = self.scene.character_qpos(state.body.qpos)
         numbers = features.state(
