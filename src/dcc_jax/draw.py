@@ -10,24 +10,23 @@ import contextlib
 import importlib
 import os
 import sys
+import warnings
 from collections.abc import Iterator, Sequence
 from ctypes.util import find_library
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import mujoco
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from dcc_jax.draw_plain import Camera, plain_frames
+from dcc_jax.draw_plain import Camera, Poses, annotate, plain_frames
 
 Arrow = tuple[np.ndarray, np.ndarray]
-"""A force arrow: the point it acts on and the vector to draw, both [3], world, m."""
+"""A force arrow: where it begins and the vector to draw, both [3], world, m."""
 
 GHOST = np.array([0.35, 0.75, 0.95, 0.35], np.float32)
-ARROW = np.array([0.95, 0.35, 0.10, 1.0], np.float32)
-ARROW_WIDTH = 0.018  # m
-_said_fallback = False
 
 
 @dataclass(frozen=True)
@@ -51,6 +50,8 @@ def frames(
     size: tuple[int, int] = (640, 480),
     ghost_qpos: np.ndarray | None = None,
     arrows: Sequence[Sequence[Arrow]] | None = None,
+    captions: Sequence[str] | None = None,
+    mocap: tuple[np.ndarray, np.ndarray] | None = None,
     fallback: bool | None = None,
 ) -> Iterator[np.ndarray]:
     """Draws one picture a pose.
@@ -61,7 +62,10 @@ def frames(
         camera: from where; the default follows the pelvis from the front left.
         size: width and height in pixels.
         ghost_qpos: a second, translucent copy of the moving bodies [T, nq].
-        arrows: per frame, the force arrows to draw.
+        arrows: per frame, the force arrows to draw, in front of everything.
+        captions: per frame, a line of text at the top.
+        mocap: positions [T, nmocap, 3] and orientations [T, nmocap, 4] of the model's
+            kinematic bodies; None: as the model has them.
         fallback: draw with matplotlib (True), with OpenGL (False), or with what works.
 
     Yields:
@@ -74,18 +78,35 @@ def frames(
     _check("qpos", qpos, model.nq, len(qpos))
     if ghost_qpos is not None:
         _check("ghost_qpos", np.asarray(ghost_qpos), model.nq, len(qpos))
-    if arrows is not None and len(arrows) != len(qpos):
-        raise ValueError(f"arrows has {len(arrows)} frames, qpos has {len(qpos)}")
+    for name, rows in {"arrows": arrows, "captions": captions}.items():
+        if rows is not None and len(rows) != len(qpos):
+            raise ValueError(f"{name} has {len(rows)} frames, qpos has {len(qpos)}")
     view = View() if camera is None else camera
     if fallback is None:
         fallback = not opengl_works()
     looked_at = _follow(model, qpos, view)
-    ghost = None if ghost_qpos is None else np.asarray(ghost_qpos, float)
-    if not fallback:
-        return _opengl_frames(model, qpos, view, looked_at, size, ghost, arrows)
     angles = (view.azimuth, view.elevation, view.distance)
     cameras = [Camera(point, *angles, size) for point in looked_at]
-    return plain_frames(model, qpos, cameras, ghost, arrows, (GHOST, ARROW))
+    ghost = None if ghost_qpos is None else np.asarray(ghost_qpos, float)
+    poses = Poses(model, qpos, ghost, mocap)
+    if fallback:
+        images = plain_frames(poses, cameras, GHOST)
+    else:
+        _choose_backend()
+        images = _opengl_frames(poses, view, looked_at, size)
+    return _annotated(images, cameras, arrows, captions)
+
+
+def _annotated(
+    images: Iterator[np.ndarray],
+    cameras: Sequence[Camera],
+    arrows: Sequence[Sequence[Arrow]] | None,
+    captions: Sequence[str] | None,
+) -> Iterator[np.ndarray]:
+    for index, image in enumerate(images):
+        chosen = () if arrows is None else arrows[index]
+        text = "" if captions is None else captions[index]
+        yield annotate(image, cameras[index], chosen, text)
 
 
 def _check(name: str, q: np.ndarray, nq: int, count: int) -> None:
@@ -93,18 +114,21 @@ def _check(name: str, q: np.ndarray, nq: int, count: int) -> None:
         raise ValueError(f"{name} must have shape ({count}, {nq}), got {q.shape}")
 
 
+@cache
 def opengl_works() -> bool:
-    """Whether MuJoCo can draw offscreen here; says so once when it cannot."""
-    global _said_fallback
+    """Whether MuJoCo can draw offscreen here; says so when it cannot.
+
+    Asked once: after a failure MuJoCo aborts the process at the next attempt.
+    """
     _choose_backend()
     try:
         probe = mujoco.MjModel.from_xml_string("<mujoco><worldbody/></mujoco>")
-        mujoco.Renderer(probe, 8, 8).close()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # glfw tells at length
+            mujoco.Renderer(probe, 8, 8).close()
         return True
     except Exception as error:  # every GL backend fails with a type of its own
-        if not _said_fallback:
-            print(f"no OpenGL here ({error}): drawing with matplotlib", file=sys.stderr)
-            _said_fallback = True
+        print(f"no OpenGL here ({error}): drawing with matplotlib", file=sys.stderr)
         return False
 
 
@@ -137,58 +161,38 @@ def _follow(model: mujoco.MjModel, qpos: np.ndarray, view: View) -> np.ndarray:
 
 
 def _opengl_frames(
-    model: mujoco.MjModel,
-    qpos: np.ndarray,
-    view: View,
-    looked_at: np.ndarray,
-    size: tuple[int, int],
-    ghost: np.ndarray | None,
-    arrows: Sequence[Sequence[Arrow]] | None,
+    poses: Poses, view: View, looked_at: np.ndarray, size: tuple[int, int]
 ) -> Iterator[np.ndarray]:
     width, height = size
+    model = poses.model
     model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
     model.vis.global_.offheight = max(model.vis.global_.offheight, height)
-    data, second = mujoco.MjData(model), mujoco.MjData(model)
     camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
     camera.azimuth, camera.elevation = view.azimuth, view.elevation
     camera.distance = view.distance
     with mujoco.Renderer(model, height, width, max_geom=4000) as renderer:
-        for index, q in enumerate(qpos):
-            data.qpos[:] = q
-            mujoco.mj_forward(model, data)
-            camera.lookat[:] = looked_at[index]
+        for (data, ghost), point in zip(poses, looked_at, strict=True):
+            camera.lookat[:] = point
             renderer.update_scene(data, camera, option)
             if ghost is not None:
-                second.qpos[:] = ghost[index]
-                _add_ghost(model, second, option, renderer.scene)
-            for point, vector in arrows[index] if arrows is not None else ():
-                _add_arrow(renderer.scene, np.asarray(point), np.asarray(vector))
+                _add_ghost(poses, data, ghost, option, renderer.scene)
             yield renderer.render().copy()
 
 
 def _add_ghost(
-    model: mujoco.MjModel,
+    poses: Poses,
     data: mujoco.MjData,
+    ghost: mujoco.MjData,
     option: mujoco.MjvOption,
     scene: mujoco.MjvScene,
 ) -> None:
-    mujoco.mj_forward(model, data)
     first = scene.ngeom
-    dynamic = mujoco.mjtCatBit.mjCAT_DYNAMIC
-    mujoco.mjv_addGeoms(model, data, option, mujoco.MjvPerturb(), int(dynamic), scene)
+    dynamic, nothing = int(mujoco.mjtCatBit.mjCAT_DYNAMIC), mujoco.MjvPerturb()
+    mujoco.mjv_addGeoms(poses.model, ghost, option, nothing, dynamic, scene)
+    apart = poses.apart(data, ghost)
     for geom in scene.geoms[first : scene.ngeom]:
-        geom.rgba[:] = GHOST
+        geom.rgba[:] = GHOST if apart[geom.objid] else 0.0
         geom.matid = -1
-
-
-def _add_arrow(scene: mujoco.MjvScene, point: np.ndarray, vector: np.ndarray) -> None:
-    if scene.ngeom >= scene.maxgeom or np.linalg.norm(vector) < 1e-3:
-        return
-    geom = scene.geoms[scene.ngeom]
-    kind = mujoco.mjtGeom.mjGEOM_ARROW
-    mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), ARROW)
-    mujoco.mjv_connector(geom, kind, ARROW_WIDTH, point, point + vector)
-    scene.ngeom += 1
 
 
 def write_mp4(path: str | Path, images: Iterator[np.ndarray], fps: float) -> None:
