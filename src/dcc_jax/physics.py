@@ -152,6 +152,8 @@ def _row_pattern(model: mujoco.MjModel, contact_bodies: np.ndarray) -> np.ndarra
     for kind, count in order:
         for i in np.flatnonzero(model.eq_type == kind):
             one, other = model.eq_obj1id[i], model.eq_obj2id[i]
+            if model.eq_objtype[i] == mujoco.mjtObj.mjOBJ_SITE:
+                one, other = model.site_bodyid[[one, other]]
             rows += [_chain(model, one) | _chain(model, other)] * count
     for i in np.flatnonzero(model.jnt_limited):
         row = np.zeros(model.nv, bool)

@@ -1,0 +1,283 @@
+"""The ball on the head: an inverted pendulum, its pushes, and forces that are not."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from dcc_jax import physics, quat
+from dcc_jax.character import Character, asset_path, compose_scene
+from dcc_jax.env.environment import EnvConfig, Environment
+from dcc_jax.motion.clip import load_clip
+from dcc_jax.motion.reference import make_references
+from dcc_jax.tasks import ball
+from dcc_jax.tasks.ball import Ball
+
+TASK = Ball()
+GRAVITY = 9.81  # m/s^2
+# Of pole and ball about the pivot, from the fields alone: a rod and a full sphere.
+MOMENT = TASK.pole_length * (0.5 * TASK.pole_mass + TASK.ball_mass)  # kg m
+INERTIA = (
+    TASK.pole_mass * TASK.pole_length**2 / 3
+    + TASK.ball_mass * TASK.pole_length**2
+    + 0.4 * TASK.ball_mass * TASK.ball_radius**2
+)  # kg m^2
+
+
+@pytest.fixture(scope="module")
+def environment(character: Character) -> Environment:
+    references = make_references([load_clip(asset_path("motions/stand.npz"))])
+    return Environment(TASK, character, references, EnvConfig())
+
+
+# The scene.
+
+
+def test_pole_and_ball_have_the_mass_and_the_inertia_that_the_fields_say(environment):
+    model = environment.scene.model
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    pole = model.body("pole")
+    np.testing.assert_allclose(pole.mass, TASK.pole_mass + TASK.ball_mass)
+    np.testing.assert_allclose(pole.mass * pole.ipos[2], MOMENT, rtol=1e-6)
+    full = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, full)
+    dof = model.joint("pole").dofadr[0]
+    # The caps of the capsule are not those of a thin rod.
+    tilting = np.diag(full)[dof + 3 : dof + 5]
+    np.testing.assert_allclose(tilting, INERTIA, rtol=2e-3)
+
+
+def test_the_ball_is_at_the_tip_and_the_pole_is_joined_to_the_crown(environment):
+    model = environment.scene.model
+    assert model.geom("ball").pos.tolist() == [0.0, 0.0, TASK.pole_length]
+    assert model.geom("ball").size[0] == TASK.ball_radius
+    assert model.joint("pole").type == mujoco.mjtJoint.mjJNT_FREE
+    assert model.eq_type.tolist() == [mujoco.mjtEq.mjEQ_CONNECT]
+    assert model.eq_active0.tolist() == [1]
+    joined = [model.site(model.eq_obj1id[0]), model.site(model.eq_obj2id[0])]
+    owners = [model.body(int(site.bodyid[0])).name for site in joined]
+    assert owners == ["head", "pole"]
+    head = model.geom("head")
+    top = head.pos + np.array([0.0, 0.0, head.size[0]])
+    np.testing.assert_allclose(joined[0].pos, top, atol=1e-9)
+    assert joined[1].pos.tolist() == [0.0, 0.0, 0.0]
+
+
+def test_an_episode_begins_with_the_pole_on_the_crown_near_upright(environment):
+    scene, model = environment.scene, environment.scene.model
+    data, tilts = mujoco.MjData(model), []
+    for seed, seconds in enumerate((0.5, 3.0, 7.0)):
+        reference = environment.references.state_at(0, seconds)
+        _, qpos, qvel = TASK.reset(jax.random.key(seed), scene, reference)
+        data.qpos[:], data.qvel[:] = qpos, qvel
+        mujoco.mj_forward(model, data)
+        gap = data.site("crown").xpos - data.site("foot_of_pole").xpos
+        assert np.linalg.norm(gap) < 1e-5
+        tilts.append(np.arccos(data.body("pole").xmat[8]))
+    assert 0.0 < max(tilts) < np.sqrt(2.0) * TASK.tilt + 1e-3
+
+
+# The pendulum.
+
+
+@pytest.fixture(scope="module")
+def pinned(character: Character) -> physics.Scene:
+    """The scene with a character too heavy to move, upright as MuJoCo has it."""
+    model = compose_scene(character, floor=False, extend=TASK.extend)
+    model.dof_armature[: character.nv] = 1e5
+    return physics.make_scene(model, character)
+
+
+@pytest.fixture(scope="module")
+def tipping(pinned) -> np.ndarray:
+    """Angle of the pole from the vertical every physics step, from 0.1 rad, [T]."""
+    start = jnp.asarray(pinned.model.qpos0, jnp.float32)
+    q_adr, _ = ball._pole(pinned)
+    head = pinned.model.body("head").id
+    data = mujoco.MjData(pinned.model)
+    mujoco.mj_kinematics(pinned.model, data)
+    crown = data.xpos[head] + np.asarray(ball.CROWN)
+    lean = np.array([np.cos(0.05), np.sin(0.05), 0.0, 0.0])
+    pose = jnp.asarray(np.concatenate([crown, lean]), jnp.float32)
+    start = start.at[q_adr : q_adr + 7].set(pose)
+
+    def step(body: physics.State, _):
+        kin = physics.kinematics(pinned, body)
+        solution = physics.solve(pinned, kin, body, jnp.zeros(pinned.model.nv))
+        body = physics.integrate(pinned, body, solution)
+        return body, ball._upright(pinned, body)
+
+    def fall(qpos):
+        body = physics.initial_state(pinned, qpos, jnp.zeros(pinned.model.nv))
+        return jax.lax.scan(step, body, None, length=120)[1]
+
+    return np.arccos(np.asarray(jax.jit(fall)(start), float))
+
+
+def test_the_pole_tips_at_the_analytic_rate(pinned, tipping):
+    """I theta'' = m g l sin theta, which grows by exp(sqrt(m g l / I) t)."""
+    rate = np.sqrt(MOMENT * GRAVITY / INERTIA)
+    times = pinned.timestep * np.arange(1, len(tipping) + 1)
+    expected = solve_ivp(
+        lambda t, x: [x[1], rate**2 * np.sin(x[0])],
+        (0.0, times[-1]),
+        [0.1, 0.0],
+        t_eval=times,
+        rtol=1e-8,
+    ).y[0]
+    assert expected[-1] > 0.3, "long enough to tell one rate from another"
+    np.testing.assert_allclose(tipping, expected, rtol=0.03)
+
+
+def test_a_push_changes_the_balls_velocity_and_not_the_pivots(environment):
+    scene = environment.scene
+    reference = environment.references.state_at(0, 1.0)
+    _, qpos, qvel = TASK.reset(jax.random.key(0), scene, reference)
+    q_adr, _ = ball._pole(scene)
+    leaning = quat.exp(jnp.array([0.3, -0.2, 0.1]))
+    qpos = qpos.at[q_adr + 3 : q_adr + 7].set(leaning)
+    body = physics.initial_state(scene, qpos, qvel)
+    upright = physics.initial_state(
+        scene, qpos.at[q_adr + 3 : q_adr + 7].set(jnp.array([1.0, 0, 0, 0])), qvel
+    )
+    speeds = []
+    for seed in range(8):
+        key, again = jax.random.split(jax.random.key(seed))
+        for start, keep in ((body, False), (upright, True)):
+            state, pushed = TASK.control_step(
+                jax.random.clone(key), scene, ball.State(jnp.asarray(-0.01)), start
+            )
+            before, after = (
+                [ball._along_pole(scene, b, h)[1] for h in (0.0, TASK.pole_length)]
+                for b in (start, pushed)
+            )
+            np.testing.assert_allclose(after[0], before[0], atol=1e-6)
+            change = np.asarray(after[1] - before[1])
+            assert np.linalg.norm(change) <= TASK.push[1] + 1e-5
+            if keep:
+                assert abs(change[2]) < 1e-6, "the push is horizontal"
+                speeds.append(np.linalg.norm(change))
+            assert float(state.next_push) > TASK.interval - 0.1
+        waiting = ball.State(jnp.asarray(0.5))
+        _, rest = TASK.control_step(again, scene, waiting, body)
+        np.testing.assert_array_equal(rest.qvel, body.qvel)
+    low, high = TASK.push
+    assert low <= min(speeds) and max(speeds) <= high + 1e-6
+    assert max(speeds) - min(speeds) > 0.2 * (high - low)
+
+
+# What the policy sees and gets.
+
+
+@pytest.mark.parametrize("lean", [0.0, 0.4])
+def test_reward_falls_with_the_balls_offset_from_the_head(environment, lean):
+    scene = environment.scene
+    reference = environment.references.state_at(0, 1.0)
+    _, qpos, qvel = TASK.reset(jax.random.key(0), scene, reference)
+    q_adr, _ = ball._pole(scene)
+    turn = quat.exp(jnp.array([0.0, lean, 0.0]))
+    body = physics.initial_state(scene, qpos.at[q_adr + 3 : q_adr + 7].set(turn), qvel)
+    data = mujoco.MjData(scene.model)
+    data.qpos[:] = body.qpos
+    mujoco.mj_kinematics(scene.model, data)
+    apart = (data.geom("ball").xpos - data.geom("head").xpos)[:2]
+    expected = np.exp(-2.0 * apart @ apart)
+    np.testing.assert_allclose(TASK.reward(scene, None, body), expected, rtol=1e-5)
+    numbers = TASK.evaluate(scene, None, body)
+    np.testing.assert_allclose(numbers["offset"], np.linalg.norm(apart), rtol=1e-4)
+    np.testing.assert_allclose(numbers["lean"], lean, atol=1e-3)
+
+
+def test_the_ball_is_lost_when_the_pole_leans_too_far(environment):
+    scene = environment.scene
+    qpos = jnp.asarray(scene.model.qpos0, jnp.float32)
+    q_adr, _ = ball._pole(scene)
+    for lean, lost in ((TASK.dropped - 0.05, False), (TASK.dropped + 0.05, True)):
+        turn = quat.exp(jnp.array([0.6, 0.8, 0.0]) * lean)
+        body = physics.initial_state(
+            scene, qpos.at[q_adr + 3 : q_adr + 7].set(turn), jnp.zeros(scene.model.nv)
+        )
+        assert bool(TASK.terminated(scene, None, body)) is lost
+
+
+def test_what_is_observed_does_not_depend_on_place_and_heading(environment):
+    scene, model = environment.scene, environment.scene.model
+    reference = environment.references.state_at(0, 1.0)
+    _, qpos, qvel = TASK.reset(jax.random.key(0), scene, reference)
+    q_adr, v_adr = ball._pole(scene)
+    qvel = qvel.at[v_adr : v_adr + 6].set(jnp.array([0.3, -0.2, 0.1, 0.5, 0.7, 0.0]))
+    here = TASK.observe(scene, None, physics.initial_state(scene, qpos, qvel))
+    turn = quat.exp(jnp.array([0.0, 0.0, 1.1]))
+    moved_q, moved_v = qpos, qvel
+    for q, v in ((0, 0), (q_adr, v_adr)):
+        place = quat.rotate(turn, qpos[q : q + 3]) + jnp.array([2.0, -1.0, 0.0])
+        moved_q = moved_q.at[q : q + 3].set(place)
+        facing = quat.mul(turn, qpos[q + 3 : q + 7])
+        moved_q = moved_q.at[q + 3 : q + 7].set(facing)
+        moved_v = moved_v.at[v : v + 3].set(quat.rotate(turn, qvel[v : v + 3]))
+    there = TASK.observe(scene, None, physics.initial_state(scene, moved_q, moved_v))
+    np.testing.assert_allclose(there, here, atol=1e-5)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = qpos, qvel
+    mujoco.mj_forward(model, data)
+    J = np.zeros((3, model.nv))
+    mujoco.mj_jacGeom(model, data, J, None, model.geom("ball").id)
+    heading = quat.heading(qpos[3:7])
+    speed_w = jnp.asarray(J @ data.qvel, jnp.float32)
+    speed = quat.rotate(quat.inv(heading), speed_w)
+    np.testing.assert_allclose(here[3:6], speed, atol=1e-5)
+    np.testing.assert_allclose(here[2], data.geom("ball").xpos[2], atol=1e-5)
+
+
+# The fictional forces.
+
+
+@pytest.fixture(scope="module")
+def played(environment):
+    """Four control steps: alpha 0 or 0.16, extra actions none, head, root."""
+    extra = np.zeros((4, 6), np.float32)
+    extra[1] = [0.5, 0.2, 0.0, 0.0, 0.5, 0.0]  # at alpha = 0
+    extra[2, :3] = [0.5, 0.0, 0.0]
+    extra[3, 3:] = [0.0, 0.5, 0.0]
+    alpha = jnp.array([0.0, 0.0, 0.16, 0.16])
+
+    def play(extra, alpha):
+        state = environment.reset(jax.random.key(0), alpha)
+        action = jnp.concatenate([jnp.zeros(36), extra])
+
+        def step(state, key):
+            return environment.step(key, state, action), None
+
+        keys = jax.random.split(jax.random.key(1), 4)
+        return jax.lax.scan(step, state, keys)[0]
+
+    return jax.jit(jax.vmap(play))(jnp.asarray(extra), alpha)
+
+
+def test_fictional_forces_do_not_act_in_the_simulation(played):
+    """Without compliance they change nothing at all."""
+    np.testing.assert_array_equal(played.body.qpos[0], played.body.qpos[1])
+    np.testing.assert_array_equal(played.displacement.u[0], played.displacement.u[1])
+
+
+def test_fictional_forces_displace_head_and_root(environment, played):
+    u = np.asarray(played.displacement.u)
+    tangent = np.asarray(quat.log_map(environment.kinematics.coords, u[2]))
+    assert np.linalg.norm(tangent[6:12]) > 0.005, "rad, spine and neck bend"
+    root = played.displacement.u[3, :3]
+    # 0.12 m/s an action, half of one, four control steps.
+    np.testing.assert_allclose(root, [0.0, 0.0076, 0.0], atol=0.002)
+    assert (np.asarray(played.body.qpos[2]) != np.asarray(played.body.qpos[0])).any()
+    assert not np.asarray(played.terminated).any()
+
+
+def test_numbers_that_make_no_ball_are_refused():
+    with pytest.raises(ValueError, match=r"ball\.pole_length must be positive, got 0"):
+        Ball(pole_length=0.0)
+    with pytest.raises(ValueError, match=r"ball\.head_force must be 0 or more, got -1"):
+        Ball(head_force=-1.0)
