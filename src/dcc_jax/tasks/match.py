@@ -1,0 +1,241 @@
+"""A chicken fight of two characters in one scene, each with its own policy (Sec. 5.3).
+
+Each is an environment of its own that was trained against the box; here they share the
+physics, and what each feels of the other is what the box was to it. Everything is pure
+and of ONE match, as in `env.environment`.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import mujoco
+
+from dcc_jax import physics, quat
+from dcc_jax.character import Character, add_contact, compose_scene, sole_names
+from dcc_jax.env.environment import Environment, EnvState, Plan, Substep
+from dcc_jax.motion.reference import CONTROL_DT, planar_moved
+from dcc_jax.tasks import partner
+from dcc_jax.tasks.chicken_fight import FRICTION, NEVER, TARGETS, ChickenFight, State
+
+Array = jax.Array
+
+RIVAL = "rival_"
+"""Prefix of the second character's names."""
+ROOT = "root"
+REACH = 0.15  # m; the reference's root is so far ahead, towards the opponent
+BUMP_TIME = 1.0  # s after its beginning a bump is over
+Sides = tuple[EnvState, EnvState]
+
+
+@dataclass(frozen=True)
+class Fighter(ChickenFight):
+    """One of two: hops towards the opponent, whoever that is."""
+
+    def aimed(self, scene: physics.Scene, state: State, body: physics.State) -> State:
+        """The reference ahead of the root, on its way to the opponent."""
+        root = scene.character_qpos(body.qpos)[:2]
+        adr = int(scene.model.joint(self.opponent).qposadr[0])
+        way = body.qpos[adr : adr + 2] - root
+        heading = jnp.arctan2(way[1], way[0])
+        motion = dataclasses.replace(
+            state.motion,
+            position=root + REACH * partner.direction(heading),
+            heading=heading,
+            speed=jnp.full((), max(self.gaits.speeds)),
+            acceleration=jnp.zeros(()),
+            turn=jnp.zeros(()),
+        )
+        return dataclasses.replace(state, motion=motion)
+
+    def control_step(
+        self, key: Array, scene: physics.Scene, state: State, body: physics.State
+    ) -> tuple[State, physics.State]:
+        """Nothing but the opponent comes at it."""
+        state = self.aimed(scene, state, body)
+        now = state.motion.time + CONTROL_DT
+        return dataclasses.replace(
+            state,
+            motion=dataclasses.replace(state.motion, time=now),
+            touched=jnp.where(state.touched > BUMP_TIME, NEVER, state.touched),
+            impulse=jnp.zeros(3),
+            force_peak=jnp.zeros(()),
+        ), body
+
+
+class Match:
+    """Static parts of a match; its methods are pure."""
+
+    def __init__(
+        self, first: Environment, second: Environment, *, distance: float = 1.2
+    ) -> None:
+        """Puts two characters into one scene.
+
+        Args:
+            first: an environment of the chicken fight, with its own character.
+            second: another one; its physics rate must be that of the first.
+            distance: m between the roots at the reset.
+
+        Raises:
+            ValueError: the two do not step at the same rate.
+        """
+        rates = first.config.physics_rate, second.config.physics_rate
+        if rates[0] != rates[1]:
+            raise ValueError(f"both must have the same physics_rate, got {rates}")
+        self.distance = distance
+        self.control_steps = first.config.control_steps
+        characters = first.scene.character, second.scene.character
+        model = compose_scene(
+            characters[0],
+            timestep=first.scene.timestep,
+            extend=_rival(characters[1]),
+        )
+        iterations = max(first.scene.newton_iterations, second.scene.newton_iterations)
+        scenes = _shared(model, characters, iterations)
+        self.fighters = (
+            Fighter(opponent=RIVAL + ROOT),
+            Fighter(prefix=RIVAL, opponent=ROOT),
+        )
+        self.sides = (
+            _at(first, scenes[0], self.fighters[0]),
+            _at(second, scenes[1], self.fighters[1]),
+        )
+
+    @property
+    def scene(self) -> physics.Scene:
+        """The scene, as the first character sees it."""
+        return self.sides[0].scene
+
+    def reset(self, key: Array, alpha: Array | None = None) -> Sides:
+        """Two moments of the references, face to face.
+
+        Args:
+            key: consumed.
+            alpha: levels of compliance [2]; None: as the two are configured.
+        """
+        keys = jax.random.split(key, 2)
+        away = 0.5 * self.distance
+        spots = ((0.0, -away), (math.pi, away))
+        states = []
+        for i, (side, (turn, x)) in enumerate(zip(self.sides, spots, strict=True)):
+            state = side.reset(keys[i], None if alpha is None else alpha[i])
+            states.append(_stood(side, state, turn, jnp.array([x, 0.0])))
+        return self._sharing(states)
+
+    def step(self, key: Array, states: Sides, actions: tuple[Array, Array]) -> Sides:
+        """One control step of both.
+
+        Args:
+            key: consumed.
+            states: of the two sides; their body is one and the same.
+            actions: of the two sides, as `Environment.step` has them.
+        """
+        keys = jax.random.split(key, 2)
+        begun = [
+            side.begin(keys[i], states[i], actions[i])
+            for i, side in enumerate(self.sides)
+        ]
+        plans = [plan for _, plan in begun]
+        ends, _ = jax.lax.scan(
+            lambda carry, _: (self._substep(carry, plans), None),
+            [start for start, _ in begun],
+            None,
+            length=self.control_steps,
+        )
+        first, second = (
+            side.end(states[i], plans[i], ends[i]) for i, side in enumerate(self.sides)
+        )
+        return first, second
+
+    def _substep(self, carry: list[Substep], plans: list[Plan]) -> list[Substep]:
+        body = carry[0].body
+        kin = physics.kinematics(self.scene, body)
+        both = list(zip(self.sides, carry, plans, strict=True))
+        torques = [side.torque(own, plan) for side, own, plan in both]
+        qfrc = jnp.zeros(self.scene.model.nv)
+        for side, tau in zip(self.sides, torques, strict=True):
+            qfrc = qfrc + side.scene.scatter_character(tau)
+        solution = physics.solve(self.scene, kin, body, qfrc)
+        return [
+            side.react(own, plan, kin, tau, solution)[0]
+            for (side, own, plan), tau in zip(both, torques, strict=True)
+        ]
+
+    def _sharing(self, states: list[EnvState]) -> Sides:
+        """The two states with one body, each aware of the other."""
+        first, second = (s.scene for s in self.sides)
+        mine, theirs = (state.body for state in states)
+        body = physics.initial_state(
+            first,
+            mine.qpos.at[second.qpos_adr : second.qpos_adr + 55].set(
+                second.character_qpos(theirs.qpos)
+            ),
+            mine.qvel + theirs.qvel,
+        )
+        seeing = []
+        for i, side in enumerate(self.sides):
+            task = self.fighters[i].aimed(side.scene, states[i].task, body)
+            state = dataclasses.replace(states[i], body=body, task=task)
+            seeing.append(side.observed(state))
+        return seeing[0], seeing[1]
+
+
+def _rival(character: Character) -> Callable[[mujoco.MjSpec], None]:
+    """Adds a second character to a scene that has one and a floor."""
+
+    def extend(spec: mujoco.MjSpec) -> None:
+        frame = spec.worldbody.add_frame()
+        spec.attach(character.spec(), prefix=RIVAL, frame=frame)
+        for sole in sole_names(spec):
+            if sole.startswith(RIVAL):
+                add_contact(spec, "floor", sole)
+        for mine in TARGETS:
+            for theirs in TARGETS:
+                add_contact(spec, mine, RIVAL + theirs, FRICTION)
+
+    return extend
+
+
+def _shared(
+    model: mujoco.MjModel, characters: tuple[Character, Character], iterations: int
+) -> tuple[physics.Scene, physics.Scene]:
+    """One scene, as either of its characters sees it; stable PD in both."""
+    first = physics.make_scene(model, characters[0], newton_iterations=iterations)
+    both = physics.make_scene(
+        first.model, characters[1], root=RIVAL + ROOT, newton_iterations=iterations
+    )
+    second = dataclasses.replace(
+        both, spd_diagonal=first.spd_diagonal + both.spd_diagonal
+    )
+    mine = {name: getattr(first, name) for name in ("character", "qpos_adr", "dof_adr")}
+    return dataclasses.replace(second, **mine), second
+
+
+def _at(environment: Environment, scene: physics.Scene, task: Fighter) -> Environment:
+    """The same environment in another scene."""
+    moved = copy.copy(environment)
+    moved.scene, moved.task = scene, task
+    return moved
+
+
+def _stood(side: Environment, state: EnvState, turn: float, spot: Array) -> EnvState:
+    """A state at the reset with its character turned and moved over the ground."""
+    scene, body = side.scene, state.body
+    angle = jnp.asarray(turn)
+    about_z = quat.exp(jnp.array([0.0, 0.0, turn]))
+    q = planar_moved(scene.character_qpos(body.qpos), angle, spot)
+    qd = scene.character_qvel(body.qvel)
+    qd = qd.at[:3].set(quat.rotate(about_z, qd[:3]))
+    qpos = jax.lax.dynamic_update_slice(body.qpos, q, (scene.qpos_adr,))
+    qvel = scene.scatter_character(qd)
+    return dataclasses.replace(
+        state,
+        body=dataclasses.replace(body, qpos=qpos, qvel=qvel),
+        q_previous=planar_moved(state.q_previous, angle, spot),
+    )
