@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from inverse import effort
 from scipy.spatial.transform import Rotation
 
 from dcc_jax.character import asset_path, load_character
@@ -11,18 +12,18 @@ from dcc_jax.motion.author_kinematics import (
     GRAVITY,
     Pose,
     angular_velocity,
-    body,
     momentum,
 )
 from dcc_jax.motion.author_steps import SOLE_RADIUS, sole_spheres
-from dcc_jax.motion.clip import load_clip, velocities
+from dcc_jax.motion.clip import load_clip, save_clip, velocities
 
 FEET = (11, 14)  # bodies
 RIGHT_HAND = 8
 DT = 1.0 / 30.0
 TOUCH = 2e-3  # m
 ALL = clip_names()
-FLYING = ("jump", "jump_high", "jump_series", "backflip", "run", "run_cycle", "hop")
+GROUNDED = ("stand", "recover", "balance", "walk", "door")
+FLYING = tuple(name for name in ALL if not name.startswith(GROUNDED))
 
 
 class Motion:
@@ -59,13 +60,13 @@ def test_every_recipe_ships():
     assert {path.stem for path in folder.glob("*.npz")} == set(ALL)
 
 
-def test_the_same_code_gives_the_same_clip():
-    made, shipped = (
-        author("recover_045"),
-        load_clip(asset_path("motions/recover_045.npz")),
-    )
-    np.testing.assert_array_equal(made.qpos, shipped.qpos)
-    assert (made.label, made.loop, made.fps) == ("recover", False, 30.0)
+@pytest.mark.parametrize("name", ["recover_045", "run_cycle"])
+def test_the_same_code_gives_the_same_bytes(tmp_path, name):
+    made = author(name)
+    save_clip(tmp_path / "again.npz", made)
+    shipped = asset_path(f"motions/{name}.npz")
+    assert (tmp_path / "again.npz").read_bytes() == shipped.read_bytes()
+    assert not np.signbit(made.qpos[made.qpos == 0.0]).any()
 
 
 def test_unknown_names_are_refused_with_the_known_ones():
@@ -97,7 +98,7 @@ def test_joints_stay_in_their_ranges(motions, name):
     assert np.degrees(outside.max()) < 5.0
 
 
-@pytest.mark.parametrize("name", FLYING)
+@pytest.mark.parametrize("name", [n for n in FLYING if n != "jog_cycle"])
 def test_flight_is_ballistic(motions, name):
     motion = motions[name]
     com, flights = motion.state.com, motion.flights()
@@ -118,30 +119,69 @@ def test_angular_momentum_is_constant_in_flight(motions, name):
         assert spread < 1.0 + 0.1 * np.linalg.norm(spin.mean(0) if len(spin) else 0.0)
 
 
-@pytest.mark.parametrize("name", [n for n in ALL if n not in FLYING and n != "door"])
-def test_ground_reaction_acts_under_the_feet(motions, name):
+@pytest.mark.parametrize("name", ALL)
+def test_muscles_and_soles_could_have_made_the_motion(motions, name):
+    """Forces in the friction cones under the soles move the root as it moves.
+
+    At 30 frames a second the frames next to a flight mix contact and flight, and a
+    backflip is at the limits of the body.
+    """
+    force, moment, torque, speed = 0.01, 1.0, 0.5, 10.0
+    if name.startswith("walk") or name == "door":
+        force, moment, torque = 0.15, 12.0, 0.7
+    if name in FLYING:
+        force, moment, torque, speed = 0.40, 60.0, 1.1, 22.0
+    if name == "backflip":
+        force, moment, torque, speed = 0.60, 150.0, 1.8, 28.0
+    needs = effort(motions[name].clip)
+    assert needs.force.max() < force
+    assert needs.moment.max() < moment
+    assert needs.torque.max() < torque
+    assert needs.speed < speed
+    assert np.median(needs.force) < 0.05
+    assert np.median(needs.moment) < 4.0
+
+
+@pytest.mark.parametrize("name", [n for n in ALL if n.endswith("_cycle")])
+def test_legs_stretch_in_every_step(motions, name):
+    """Nobody walks or runs in a crouch."""
     motion = motions[name]
-    com, spin = motion.state.com, motion.state.angular
-    pull = np.gradient(np.gradient(com, DT, axis=0), DT, axis=0)
-    force = pull[:, 2] + GRAVITY
-    moment = np.gradient(spin, DT, axis=0) / body().mass.sum()
-    centre = com[:, :2] - (com[:, 2:] * pull[:, :2]) / force[:, None]
-    centre = centre + np.stack([-moment[:, 1], moment[:, 0]], 1) / force[:, None]
-    inside = slice(3, -3)
-    assert force[inside].min() > 0.3 * GRAVITY
-    low = motion.height < 0.01
-    corners = np.where(low[..., None], motion.spheres[..., :2], np.nan)
-    lowest, highest = (f(corners, axis=(1, 2)) for f in (np.nanmin, np.nanmax))
-    outside = np.maximum(lowest - centre, centre - highest)[inside].max(-1)
-    assert np.percentile(outside, 95) < 0.03
-    assert outside.max() < 0.10
+    knee = Rotation.from_matrix(motion.pose.joints[:, 7]).as_rotvec()[:, 1]
+    stands = motion.height[:, 0].min(1) < TOUCH
+    hip = motion.origins[:, 9] - motion.origins[:, 11]
+    behind = np.degrees(np.arctan2(hip[:, 0], hip[:, 2]))[stands].max()
+    assert np.degrees(knee[stands].min()) < 32.0
+    assert np.degrees(knee[stands].max()) < 65.0
+    assert np.degrees(knee.max()) > 55.0  # the swinging leg is drawn up
+    assert behind > 18.0  # degrees, the leg from vertical when it leaves the ground
 
 
-def test_walk_and_run_have_their_speeds(motions):
-    for name, speed in (("walk_cycle", 1.2), ("run_cycle", 3.0)):
-        qpos = motions[name].clip.qpos
-        covered = np.linalg.norm(qpos[-1, :2] - qpos[0, :2])
-        assert covered / motions[name].clip.duration == pytest.approx(speed, rel=0.02)
+@pytest.mark.parametrize(
+    ("name", "speed"),
+    [
+        ("walk_slow_cycle", 0.8),
+        ("walk_cycle", 1.2),
+        ("walk_fast_cycle", 1.6),
+        ("jog_cycle", 2.0),
+        ("run_cycle", 3.0),
+    ],
+)
+def test_gaits_have_their_speeds(motions, name, speed):
+    clip = motions[name].clip
+    covered = np.linalg.norm(clip.qpos[-1, :2] - clip.qpos[0, :2])
+    assert covered / clip.duration == pytest.approx(speed, rel=0.02)
+
+
+@pytest.mark.parametrize("gait", ["walk", "jog", "run"])
+def test_gaits_turn_left_and_right_alike(motions, gait):
+    def turn(name: str) -> float:
+        return np.unwrap(
+            Rotation.from_matrix(motions[name].pose.pelvis).as_euler("ZYX")[:, 0]
+        )[-1]
+
+    assert turn(f"{gait}_left") > 0.9
+    assert turn(f"{gait}_right") == pytest.approx(-turn(f"{gait}_left"), abs=0.05)
+    assert turn(gait) == pytest.approx(0.0, abs=0.01)
 
 
 @pytest.mark.parametrize("name", [n for n, r in RECIPES.items() if r.loop])
@@ -159,11 +199,17 @@ def test_backflip_turns_once_backwards(motions):
     assert spin == pytest.approx(-2.0 * np.pi, abs=0.1)
 
 
-def test_hop_uses_one_leg(motions):
-    low = motions["hop"].height.min(-1) < TOUCH
-    hopping = slice(round(2.0 / DT), round(15.0 / DT))
+def test_hop_uses_one_leg_and_goes_everywhere(motions):
+    motion = motions["hop"]
+    low = motion.height.min(-1) < TOUCH
+    hopping = slice(round(2.0 / DT), round(14.5 / DT))
     assert low[hopping, 0].mean() > 0.4
     assert not low[hopping, 1].any()
+    flights = [motion.state.com[part, :2] for part in motion.flights()]
+    hops = np.array([path[-1] - path[0] for path in flights])
+    eighth = np.round(np.arctan2(hops[:, 1], hops[:, 0]) / (np.pi / 4)).astype(int) % 8
+    assert set(eighth) == set(range(8))
+    assert (eighth[1:] == eighth[:-1]).sum() > 10  # several in a row
 
 
 def test_hand_stays_on_the_knob_of_a_closed_to_open_door(motions):

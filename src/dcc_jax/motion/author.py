@@ -27,7 +27,7 @@ from dcc_jax.motion.clip import Clip
 
 SOURCE = "dcc_jax.motion.author"
 LICENCE = "Apache-2.0"
-DECIMALS = 6  # of qpos, so that the last bits of a linear solver do not show
+DECIMALS = 5  # of qpos, so that the last bits of a linear solver do not show
 
 
 @dataclass(frozen=True)

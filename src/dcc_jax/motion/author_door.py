@@ -36,13 +36,13 @@ def open_door() -> Solved:
     t = times(DURATION)
     contact = 0.62
     steps = [
-        Step(0.30, 0.50, contact, -0.06, 0.09),
-        Step(0.30, 0.48, contact, -0.10, 0.09),
-        Step(0.24, 0.48, contact, -0.10, 0.09),
-        Step(0.10, 0.48, contact, -0.06, 0.09),
+        Step(0.24, 0.50, contact, -0.06, 0.09),
+        Step(0.26, 0.48, contact, -0.10, 0.09),
+        Step(0.26, 0.48, contact, -0.10, 0.09),
+        Step(0.16, 0.48, contact, -0.06, 0.09),
         Step(0.0, 0.50, 10.0),
     ]
-    holds = stride_holds(1.30, steps, FOOT)
+    holds = stride_holds(1.60, steps, FOOT)
     busy = ramp(t, 0.5, 1.3) * (1.0 - ramp(t, RELEASE_TIME, RELEASE_TIME + 0.7))
     style = Style(lean=0.03 + 0.09 * busy, bend=0.02 + 0.05 * busy, swing=0.4)
     plan = gait_plan(t, holds, np.full(len(t), stand_height() - 0.01), style)

@@ -151,7 +151,7 @@ def _two_footed(
     return Plan(1.0 / RATE, feet, height, pelvis, upper, adapt=False)
 
 
-def backflip(rise: float = 0.52, back: float = 0.60) -> Solved:
+def backflip(rise: float = 0.56, back: float = 0.60) -> Solved:
     """A standing tucked backflip that lands `back` m behind its start."""
     top = stand_height()
     begin, crouch = 0.5, 1.05
@@ -169,7 +169,7 @@ def backflip(rise: float = 0.52, back: float = 0.60) -> Solved:
         (crouch, top - 0.26, 0.0, 6.0),
         (leave, top + TAKE_OFF, speed, -GRAVITY),
         (land, top + TAKE_OFF - sink, -fall, -GRAVITY),
-        (low, top - 0.36, 0.0, 4.0),
+        (low, top - 0.33, 0.0, 4.0),
         (end, top),
     ]
     lean = [
@@ -179,13 +179,13 @@ def backflip(rise: float = 0.52, back: float = 0.60) -> Solved:
         (leave, -0.30),
         (leave + 0.10, -0.8),
         (air, 0.25 - 0.5 * turn),
-        (land - 0.12, 0.95 - turn),
-        (land, 0.50 - turn),
-        (land + 0.12, 0.45 - turn),
+        (land - 0.12, 0.4 - turn),
+        (land, 0.0 - turn),
+        (land + 0.12, 0.25 - turn),
         (low, 0.50 - turn),
         (end, 0.03 - turn),
     ]
-    bend = [(begin, 0.02), (crouch, 0.30), (leave, -0.40), (leave + 0.2, 0.45)]
+    bend = [(begin, 0.02), (crouch, 0.30), (leave, -0.40), (leave + 0.22, 0.65)]
     bend += [(land - 0.2, 0.40), (land, 0.15), (low, 0.35), (end, 0.02)]
     swing = [(begin, 0.05), (crouch, -0.85), (leave, 2.6), (leave + 0.25, 0.95)]
     swing += [(land - 0.2, 0.9), (land, 1.0), (low, 0.7), (end, 0.05)]
@@ -201,7 +201,7 @@ def backflip(rise: float = 0.52, back: float = 0.60) -> Solved:
     t = times(end + 0.7)
     plan = _two_footed(t, holds, height_path(t, height), lean, bend, swing, flex)
     drawn = brisk(t, leave, leave + 0.28) * (1.0 - brisk(t, land - 0.26, land))
-    tuck = np.array([[0.20, side * 0.10, -0.40] for side in (1.0, -1.0)])
+    tuck = np.array([[0.18, side * 0.10, -0.34] for side in (1.0, -1.0)])
     plan = replace(
         plan,
         tuck=np.tile(tuck, (len(t), 1, 1)),
