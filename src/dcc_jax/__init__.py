@@ -15,15 +15,17 @@ if TYPE_CHECKING:
     from dcc_jax.config import make_config
     from dcc_jax.control.stiffness import stiffness
     from dcc_jax.evaluate import evaluate
+    from dcc_jax.render import render
     from dcc_jax.sweep import sweep
     from dcc_jax.train import train
 
-__all__ = ["evaluate", "make_config", "stiffness", "sweep", "train"]
+__all__ = ["evaluate", "make_config", "render", "stiffness", "sweep", "train"]
 
 _HOMES = {
     "make_config": "config",
     "train": "train",
     "evaluate": "evaluate",
+    "render": "render",
     "sweep": "sweep",
     "stiffness": "control.stiffness",
 }

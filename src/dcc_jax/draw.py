@@ -195,22 +195,38 @@ def _add_ghost(
         geom.matid = -1
 
 
+def check_video(path: str | Path) -> None:
+    """Finds out before the work whether `write_mp4` can write a video.
+
+    Raises:
+        ModuleNotFoundError: the `video` extra is not installed.
+    """
+    try:
+        import imageio.v2  # noqa: F401
+        import imageio_ffmpeg  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            f"writing {path} needs {error.name}: pip install 'dcc-jax[video]'"
+        ) from None
+
+
 def write_mp4(path: str | Path, images: Iterator[np.ndarray], fps: float) -> None:
     """Writes images [height, width, 3] uint8 as an H.264 video.
 
     Raises:
         ModuleNotFoundError: the `video` extra is not installed.
     """
-    try:
-        import imageio.v2 as imageio
-        import imageio_ffmpeg  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            f"writing {path} needs {error.name}: pip install 'dcc-jax[video]'"
-        ) from None
+    check_video(path)
+    import imageio.v2 as imageio
+
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    with imageio.get_writer(
-        path, fps=fps, codec="libx264", quality=8, macro_block_size=2
-    ) as writer:
+    with (
+        warnings.catch_warnings(),
+        imageio.get_writer(
+            path, fps=fps, codec="libx264", quality=8, macro_block_size=2
+        ) as writer,
+    ):
+        # jax warns of any child process; ffmpeg shares nothing with it.
+        warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called")
         for image in images:
             writer.append_data(image)

@@ -62,6 +62,8 @@ def _shipped(name: str) -> Path:
 def make_environment(run: Run, task: Task | None = None) -> Environment:
     """The environment of a run, without an end: episodes are as long as one likes.
 
+    A clip that the task follows in time is played from its start, not from anywhere.
+
     Args:
         run: whose configuration counts.
         task: in place of the configured one, e.g. a door of another width.
@@ -70,7 +72,12 @@ def make_environment(run: Run, task: Task | None = None) -> Environment:
         ValueError: an unknown task, clips that are missing or damaged, or another
             observation or action than the policy's.
     """
-    env = dataclasses.replace(run.config.env, episode_seconds=_FOREVER)
+    task = tasks.make_task(run.config.task) if task is None else task
+    env = dataclasses.replace(
+        run.config.env,
+        episode_seconds=_FOREVER,
+        random_start=run.config.env.random_start and not task.tracks,
+    )
     wanted = dataclasses.replace(run.config, env=env)
     try:
         environment = tasks.make_environment(wanted, task)
