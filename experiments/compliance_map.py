@@ -21,6 +21,7 @@ if __name__ == "__main__":
     runtime.setup()
 
 import argparse
+import dataclasses
 import json
 from pathlib import Path
 
@@ -34,7 +35,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 from dcc_jax import physics, quat
-from dcc_jax.character import BODIES, compose_scene, load_character
+from dcc_jax.character import BODIES, Character, compose_scene, load_character
 from dcc_jax.control import compliance, pd
 
 LEVELS = (0.0, 0.04, 0.08, 0.16)
@@ -81,7 +82,7 @@ def pushed(scene: physics.Scene, config: compliance.ComplianceConfig):
         )
         q_bar = quat.oplus(scene.coords, q_m, displacement.u)
         qfrc = pd.torque(character, state.qpos, state.qvel, q_bar, h) + J.T @ f
-        qfrc = qfrc + held(q_m, state)
+        qfrc = qfrc + held(q_m, state, h)
         state = physics.integrate(scene, state, physics.solve(scene, kin, state, qfrc))
         return (state, displacement), quat.log_map(scene.coords, displacement.u)
 
@@ -97,11 +98,25 @@ def pushed(scene: physics.Scene, config: compliance.ComplianceConfig):
     return simulate
 
 
-def held(q_m: Array, state: physics.State) -> Array:
+def held_scene(character: Character) -> physics.Scene:
+    """The character on the floor, the pelvis's spring-damper implicit like stable PD.
+
+    Its share h D + h^2 K of the diagonal is left out of what `physics.mass_solve` sees.
+    """
+    model = compose_scene(character)
+    h, extra = model.opt.timestep, np.zeros(model.nv)
+    extra[:6] = h * HOLD_DAMPING + h * h * HOLD
+    model.dof_armature += extra
+    scene = physics.make_scene(model, character)
+    return dataclasses.replace(scene, spd_diagonal=scene.spd_diagonal + extra)
+
+
+def held(q_m: Array, state: physics.State, h: float) -> Array:
     """Generalized force [nv] of the spring-damper that holds the pelvis."""
     turn = quat.log(quat.mul(quat.inv(state.qpos[3:7]), q_m[3:7]))
     error = jnp.concatenate([q_m[:3] - state.qpos[:3], turn])
-    force = HOLD * error - HOLD_DAMPING * state.qvel[:6]
+    root = state.qvel[:6]
+    force = HOLD * (error - h * root) - HOLD_DAMPING * root
     return jnp.zeros_like(state.qvel).at[:6].set(force.astype(state.qvel.dtype))
 
 
@@ -189,7 +204,7 @@ def main() -> None:
         parser.error(f"argument --force: must be positive, got {options.force}")
     options.out.mkdir(parents=True, exist_ok=True)
     character = load_character()
-    scene = physics.make_scene(compose_scene(character), character)
+    scene = held_scene(character)
     rows = {}
     for velocity in ("forward_dynamics", "measured"):
         u = simulate_all(scene, velocity, options.force)
