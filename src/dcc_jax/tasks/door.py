@@ -236,14 +236,14 @@ class Door(Task):
     def evaluate(
         self, scene: physics.Scene, state: State, body: physics.State
     ) -> dict[str, Array]:
-        """Angle in rad, whether that is open, and the forces at the knob in N."""
+        """Angle in rad, whether that is open; while the hand holds, the forces in N."""
         angle = body.qpos[_hinge(scene)[0]]
         return {
             "angle": angle,
             "open": angle >= TARGET_ANGLE,
             "holding": state.holding,
-            "orthogonal_force": state.orthogonal,
-            "parallel_force": state.parallel,
+            "orthogonal_force": jnp.where(state.holding, state.orthogonal, jnp.nan),
+            "parallel_force": jnp.where(state.holding, state.parallel, jnp.nan),
         }
 
 
