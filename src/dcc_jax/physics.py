@@ -208,6 +208,11 @@ class Kinematics:
         """[nbody, 4]."""
         return self.data.xquat
 
+    @property
+    def body_center(self) -> Array:
+        """Centres of mass [nbody, 3] m, world."""
+        return self.data.xipos
+
 
 @flax.struct.dataclass
 class Solution:

@@ -16,7 +16,7 @@ from dcc_jax.character import asset_path, compose_scene, load_character
 from dcc_jax.motion.clip import load_clip
 from dcc_jax.motion.reference import CONTROL_DT, make_references
 from dcc_jax.tasks import chicken_fight
-from dcc_jax.tasks.chicken_fight import HALF_SIZE, NEVER, ChickenFight
+from dcc_jax.tasks.chicken_fight import HALF_SIZE, LONG, ChickenFight
 
 TASK = ChickenFight()
 MASS = 36.0  # kg, the light player
@@ -30,7 +30,8 @@ def scene() -> physics.Scene:
     character = load_character(MASS)
     model = compose_scene(character, floor=False, extend=TASK.extend)
     model.opt.gravity[:] = 0.0
-    return physics.make_scene(model, character)
+    # Converged: after the default 3 iterations the readout is off by up to 2 %.
+    return physics.make_scene(model, character, newton_iterations=8)
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +42,9 @@ def reference():
 
 @pytest.fixture(scope="module")
 def began(scene, reference):
-    """The task's state and the body at a reset, at rest."""
+    """The task's state and the body at a reset, at rest, an attack under way."""
     state, qpos, qvel = TASK.reset(jax.random.key(0), scene, reference)
+    state = dataclasses.replace(state, coming=jnp.ones((), bool))
     return state, physics.initial_state(scene, qpos, jnp.zeros_like(qvel))
 
 
@@ -150,9 +152,10 @@ def test_a_bump_is_fed_to_the_bodies_it_hits_while_it_lasts(scene, bumps):
     first = touching.argmax(axis=1)
     assert first.min() > 5
     for i, start in enumerate(first):
-        assert (noted.touched[i, :start] == NEVER).all()
+        assert (noted.since_bump[i, :start] >= LONG).all()
+        assert noted.coming[i, :start].all() and not noted.coming[i, start:].any()
         since = (STEPS - 1 - start) * scene.timestep
-        np.testing.assert_allclose(noted.touched[i, -1], since, atol=1e-4)
+        np.testing.assert_allclose(noted.since_bump[i, -1], since, atol=1e-4)
 
 
 def test_forces_act_where_the_bodies_meet(bumps):
@@ -198,7 +201,7 @@ def test_an_attack_takes_its_time_and_then_waits_for_the_next(scene, began, atta
         after.next_attack, waiting.next_attack - CONTROL_DT, atol=1e-6
     )
     np.testing.assert_array_equal(same.qpos, body.qpos)
-    assert float(after.touched) == NEVER
+    assert state.coming.all() and after.coming
 
 
 def test_the_box_lets_go_after_a_bump_and_not_before(scene, began):
@@ -206,8 +209,16 @@ def test_the_box_lets_go_after_a_bump_and_not_before(scene, began):
     _, dof = box(scene)
     body = dataclasses.replace(body, qvel=body.qvel.at[dof].set(1.0))
     state = dataclasses.replace(state, next_attack=jnp.ones(()))
-    for touched, expected in ((NEVER, 1.0), (0.1, 1.0), (0.5, np.exp(-1.0 / 6.0))):
-        noted = dataclasses.replace(state, touched=jnp.array(touched))
+    braked = np.exp(-CONTROL_DT / TASK.brake_time)
+    for coming, since, expected in (
+        (True, LONG, 1.0),
+        (False, 0.1, 1.0),
+        (False, 0.5, braked),
+        (True, 2.0, 1.0),
+    ):
+        noted = dataclasses.replace(
+            state, coming=jnp.array(coming), since_bump=jnp.array(since)
+        )
         _, after = TASK.control_step(jax.random.key(4), scene, noted, body)
         np.testing.assert_allclose(after.qvel[dof], expected, rtol=1e-5)
 

@@ -13,7 +13,7 @@ import pytest
 from dcc_jax import tasks
 from dcc_jax.config import make_config
 from dcc_jax.env.environment import Environment
-from dcc_jax.tasks.chicken_fight import NEVER
+from dcc_jax.tasks.chicken_fight import LONG
 from dcc_jax.tasks.match import Match
 
 MASSES = 85.0, 36.0  # kg, Sec. 5.3
@@ -142,8 +142,9 @@ def test_the_light_one_is_pushed_farther(match, aloft):
 def test_both_share_one_body_and_note_the_same_bump(aloft):
     _, _, after = aloft
     np.testing.assert_array_equal(after[0].body.qpos, after[1].body.qpos)
-    np.testing.assert_array_equal(after[0].task.touched, after[1].task.touched)
-    assert after[0].task.touched[-1] < NEVER
+    since = [side.task.since_bump for side in after]
+    np.testing.assert_array_equal(since[0], since[1])
+    assert since[0].max() > LONG and since[0][-1] < 0.4
     # Only the second was told to give way.
     stiff, compliant = (side.metrics.displacement.max() for side in after)
     assert stiff < 1e-5 and compliant > 1e-4

@@ -14,13 +14,23 @@ from dcc_jax.tasks.chicken_fight import ChickenFight
 from dcc_jax.tasks.door import Door
 from dcc_jax.tasks.hand_in_hand import HandInHand
 from dcc_jax.tasks.push import Push
+from dcc_jax.tasks.sustained_push import SustainedPush
 from dcc_jax.tasks.trampoline import Trampoline
 
 if TYPE_CHECKING:
     from dcc_jax.config import Config
 
 TASKS: dict[str, type[Task]] = {
-    task.name: task for task in (Push, Trampoline, HandInHand, ChickenFight, Door, Ball)
+    task.name: task
+    for task in (
+        Push,
+        SustainedPush,
+        Trampoline,
+        HandInHand,
+        ChickenFight,
+        Door,
+        Ball,
+    )
 }
 
 

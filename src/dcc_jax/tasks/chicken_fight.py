@@ -50,7 +50,7 @@ BODIES = ("pelvis", "chest", "left_upper_arm", "right_upper_arm")
 FRICTION = 0.5
 HALF_SIZE = (0.15, 0.20, 0.45)  # m, of the box: a trunk's depth, width and height
 BOX_HEIGHT = 1.1  # m, of its middle
-NEVER = 100.0  # s
+LONG = 100.0  # s, since a bump that never was
 
 
 @flax.struct.dataclass
@@ -59,7 +59,8 @@ class State:
 
     motion: Motion  # of the reference's root
     next_attack: Array  # [] s until then
-    touched: Array  # [] s since the opponent first touched in this attack
+    coming: Array  # [] bool, the attack is under way and has not touched yet
+    since_bump: Array  # [] s since an attack first touched
     impulse: Array  # [3] N s on the character in the control step, world
     force_peak: Array  # [] N, largest sum of its contact forces in the control step
 
@@ -122,7 +123,8 @@ class ChickenFight(Task):
         state = State(
             motion=partner.begin(motion_key, self.gaits, root, jnp.zeros(2), way),
             next_attack=self.interval * jax.random.uniform(attack_key),
-            touched=jnp.full((), NEVER),
+            coming=jnp.zeros((), bool),
+            since_bump=jnp.full((), LONG),
             impulse=jnp.zeros(3),
             force_peak=jnp.zeros(()),
         )
@@ -145,7 +147,7 @@ class ChickenFight(Task):
             state,
             motion=partner.go_on(motion_key, self.gaits, state.motion),
             next_attack=left - CONTROL_DT,
-            touched=jnp.where(due, NEVER, state.touched),
+            coming=due | state.coming,
             impulse=jnp.zeros(3),
             force_peak=jnp.zeros(()),
         ), body
@@ -177,8 +179,8 @@ class ChickenFight(Task):
         self, scene: physics.Scene, state: State, body: physics.State
     ) -> physics.State:
         """The box brakes a while after it has bumped, so that it does not lean on."""
-        bumped = (state.touched > self.let_go) & (state.touched < NEVER)
-        slower = jnp.where(bumped, math.exp(-CONTROL_DT / self.brake_time), 1.0)
+        lets_go = ~state.coming & (state.since_bump > self.let_go)
+        slower = jnp.where(lets_go, math.exp(-CONTROL_DT / self.brake_time), 1.0)
         _, dof = _address(scene, self.opponent)
         qvel = body.qvel.at[dof : dof + 3].multiply(slower)
         return dataclasses.replace(body, qvel=qvel)
@@ -204,12 +206,12 @@ class ChickenFight(Task):
         force = jnp.stack([f for f, _ in sums])
         total = jnp.sum(force, axis=0)
         size = jnp.sqrt(jnp.sum(jnp.square(total)) + 1e-12)
-        touches = jnp.any(force != 0.0)
-        first = touches & (state.touched >= NEVER)
-        later = jnp.where(state.touched < NEVER, state.touched + scene.timestep, NEVER)
+        first = state.coming & jnp.any(force != 0.0)
+        later = state.since_bump + scene.timestep
         state = dataclasses.replace(
             state,
-            touched=jnp.where(first, 0.0, later),
+            coming=state.coming & ~first,
+            since_bump=jnp.where(first, 0.0, later),
             impulse=state.impulse + scene.timestep * total,
             force_peak=jnp.maximum(state.force_peak, size),
         )
@@ -252,7 +254,7 @@ class ChickenFight(Task):
             "bump_force_peak": state.force_peak,
             "path_distance": _length(q[:2] - root),
             "opponent_distance": _length(q[:2] - body.qpos[adr : adr + 2]),
-            "since_bump": state.touched,
+            "since_bump": state.since_bump,
         }
 
 

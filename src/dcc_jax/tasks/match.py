@@ -22,7 +22,7 @@ from dcc_jax.character import Character, add_contact, compose_scene, sole_names
 from dcc_jax.env.environment import Environment, EnvState, Plan, Substep
 from dcc_jax.motion.reference import CONTROL_DT, planar_moved
 from dcc_jax.tasks import partner
-from dcc_jax.tasks.chicken_fight import FRICTION, NEVER, TARGETS, ChickenFight, State
+from dcc_jax.tasks.chicken_fight import FRICTION, TARGETS, ChickenFight, State
 
 Array = jax.Array
 
@@ -63,7 +63,7 @@ class Fighter(ChickenFight):
         return dataclasses.replace(
             state,
             motion=dataclasses.replace(state.motion, time=now),
-            touched=jnp.where(state.touched > BUMP_TIME, NEVER, state.touched),
+            coming=state.since_bump > BUMP_TIME,
             impulse=jnp.zeros(3),
             force_peak=jnp.zeros(()),
         ), body

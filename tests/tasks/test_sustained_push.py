@@ -1,0 +1,141 @@
+"""The schedule of the pushes, and what they do by Newton's second law."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from dcc_jax import physics
+from dcc_jax.character import asset_path, load_character
+from dcc_jax.env.task import RootTarget
+from dcc_jax.motion.clip import load_clip
+from dcc_jax.motion.reference import CONTROL_DT, make_references
+from dcc_jax.tasks.sustained_push import State, SustainedPush
+
+TASK = SustainedPush()
+STEPS, PUSHED = 900, 30
+
+
+@pytest.fixture(scope="module")
+def references():
+    clips = [load_clip(asset_path(f"motions/{name}.npz")) for name in TASK.clips]
+    return make_references(clips)
+
+
+@pytest.fixture(scope="module")
+def schedules(scene, references):
+    """States of PUSHED characters after each of STEPS control steps, [T, B]."""
+    reset_key, run_key = jax.random.split(jax.random.key(0))
+    standing = references.state_at(0, 0.0)
+    begin = jax.vmap(lambda key: TASK.reset(key, scene, standing)[0])
+    go_on = jax.vmap(lambda key, state: TASK.control_step(key, scene, state, None)[0])
+
+    @jax.jit
+    def run(first, keys):
+        def step(state, keys):
+            state = go_on(keys, state)
+            return state, state
+
+        return jax.lax.scan(step, begin(first), keys)[1]
+
+    first = jax.random.split(reset_key, PUSHED)
+    keys = jax.random.split(run_key, (STEPS, PUSHED))
+    return jax.tree.map(np.array, run(first, keys))
+
+
+def spans(pushing: np.ndarray) -> tuple[list[int], list[int]]:
+    """Lengths in control steps of whole pushes and whole pauses of one character."""
+    edges = np.flatnonzero(np.diff(pushing))
+    lengths = np.diff(edges).tolist()
+    first_is_push = not pushing[0]
+    return lengths[not first_is_push :: 2], lengths[first_is_push::2]
+
+
+def test_pushes_and_pauses_take_turns(schedules):
+    pushing = np.any(schedules.force_w != 0.0, axis=-1)
+    pushes, pauses = zip(*(spans(row) for row in pushing.T), strict=True)
+    for lengths, (shortest, longest) in (
+        (np.concatenate(pushes), TASK.duration),
+        (np.concatenate(pauses), TASK.pause),
+    ):
+        assert len(lengths) > 100
+        seconds = lengths * CONTROL_DT
+        assert seconds.min() > shortest - 0.01
+        assert seconds.max() < longest + 2.01 * CONTROL_DT
+
+
+def test_a_push_does_not_change_while_it_lasts(schedules):
+    force = schedules.force_w
+    same = (force[1:] == force[:-1]).all(axis=-1)
+    begun = schedules.since[1:] <= schedules.since[:-1]
+    ended = (force[1:] == 0.0).all(axis=-1)
+    assert (same | begun | ended).all()
+    np.testing.assert_array_equal(
+        schedules.target[1:][~begun], schedules.target[:-1][~begun]
+    )
+
+
+def test_pushes_have_all_directions_strengths_and_bodies(schedules):
+    begun = schedules.since[1:] <= schedules.since[:-1]
+    force, target = schedules.force_w[1:][begun], schedules.target[1:][begun]
+    size = np.linalg.norm(force, axis=-1)
+    weak, strong = TASK.strength
+    assert weak <= size.min() < weak + 5 and strong - 5 < size.max() <= strong + 1e-3
+    slope = np.arcsin(force[:, 2] / size)
+    assert 0.9 * TASK.slope < np.abs(slope).max() <= TASK.slope + 1e-5
+    way = np.arctan2(force[:, 1], force[:, 0])
+    assert np.histogram(way, bins=4, range=(-np.pi, np.pi))[0].min() > len(way) / 8
+    assert np.bincount(target).min() > len(target) / 10
+
+
+def test_a_push_accelerates_the_character_by_force_over_mass(
+    scene, character, compiled_solve
+):
+    # Aloft, with nothing else but gravity: M qacc + bias = J^T f.
+    count = len(TASK.bodies)
+    q = np.array(scene.model.qpos0, np.float32)
+    q[2] += 5.0
+    state = jax.vmap(lambda _: physics.initial_state(scene, q, jnp.zeros(42)))(
+        jnp.arange(count)
+    )
+    force = jnp.array([30.0, -50.0, 10.0])
+
+    @jax.jit
+    @jax.vmap
+    def pushed(state, target):
+        kin = physics.kinematics(scene, state)
+        push = State(force, target, jnp.ones(()), jnp.ones(()))
+        return TASK.applied(scene, push, kin, jnp.zeros(())), TASK._place(
+            scene, push, kin
+        )
+
+    qfrc, (body, point) = pushed(state, jnp.arange(count))
+    solution, *_ = compiled_solve(state, qfrc, jnp.zeros((count, 42)))
+    data = mujoco.MjData(scene.model)
+    data.qpos[:] = q
+    for i, name in enumerate(TASK.bodies):
+        assert scene.model.body(int(body[i])).name == name
+        data.xfrc_applied[:] = 0.0
+        data.xfrc_applied[int(body[i]), :3] = force
+        mujoco.mj_forward(scene.model, data)
+        np.testing.assert_allclose(point[i], data.xipos[int(body[i])], atol=1e-5)
+        np.testing.assert_allclose(
+            solution.qacc[i], data.qacc, rtol=2e-3, atol=2e-3 * np.abs(data.qacc).max()
+        )
+    assert character.mass == load_character().mass
+
+
+def test_reference_of_a_walk_and_a_run_goes_on_and_of_a_stand_stays(scene, references):
+    for clip, name in enumerate(TASK.clips):
+        speed = {"walk_cycle": 1.2, "run_cycle": 3.0}.get(name, 0.0)
+        start = references.state_at(clip, 0.2)
+        target = TASK.root_target(
+            scene, None, RootTarget(start.qpos[:2], start.travel), jnp.array(4.0)
+        )
+        assert np.linalg.norm(target.velocity) == pytest.approx(speed, abs=0.05)
+        assert np.linalg.norm(target.position - start.qpos[:2]) == pytest.approx(
+            4.0 * speed, abs=0.2
+        )
