@@ -63,6 +63,8 @@ class Task:
     clock: ClassVar[str | None] = None
     """The entry of `evaluate`, in s since an event (a throw, a landing), over which an
     evaluation draws its curves; None: over the time since the reset."""
+    azimuth: ClassVar[float] = 130.0
+    """Degrees, where pictures look: 90 is along +y, 180 along -x."""
 
     def extend(self, spec: mujoco.MjSpec) -> None:
         """Adds bodies and contact pairs to the scene of character and floor."""

@@ -188,6 +188,7 @@ def _images(
     return draw.frames(
         environment.scene.model,
         motion.qpos,
+        camera=draw.View(azimuth=environment.task.azimuth),
         ghost_qpos=displaced(environment, motion),
         arrows=_arrows(recording.motion, times, episodes),
         captions=_captions(plan, recording, times, episodes),
