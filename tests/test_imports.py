@@ -20,7 +20,9 @@ LEVELS = {
     "draw_plain": 0,
     "logs": 0,
     "command": 0,
+    "curves": 0,  # reads what the logs wrote
     "character": 1,
+    "sparsity": 1,
     "solver": 1,
     "physics": 2,
     "motion": 3,

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dcc_jax import command, runtime
+from dcc_jax import command, curves, runtime
 
 if TYPE_CHECKING:
     from dcc_jax.config import Config
@@ -52,7 +52,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         return command.complain(PROGRAM, str(error), 2)
     try:
-        training.execute(run)
+        result = training.execute(run)
+        if result.metrics:
+            curves.draw([result.run_dir], result.run_dir / "curves.png")
     except training.RunError as error:
         return command.complain(PROGRAM, str(error), 1)
     except KeyboardInterrupt:
