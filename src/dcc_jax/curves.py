@@ -46,7 +46,7 @@ def draw(run_dirs: Sequence[Path], out: Path) -> None:
                 _line(axes, rows, name, label if len(runs) == 1 else f"{run} {label}")
         axes.set_title(title, fontsize=10)
         axes.set_xlabel("M tuples")
-        if len(names) > 1 or len(runs) > 1:
+        if axes.lines and (len(names) > 1 or len(runs) > 1):
             axes.legend(fontsize=7)
     figure.suptitle(", ".join(runs))
     figure.savefig(out, dpi=100)
