@@ -130,7 +130,7 @@ def test_a_push_accelerates_the_character_by_force_over_mass(
 
 def test_reference_of_a_walk_and_a_run_goes_on_and_of_a_stand_stays(scene, references):
     for clip, name in enumerate(TASK.clips):
-        speed = {"walk_cycle": 1.2, "run_cycle": 3.0}.get(name, 0.0)
+        speed = {"walk_cycle": 1.2, "jog_cycle": 2.0, "run_cycle": 3.0}.get(name, 0.0)
         start = references.state_at(clip, 0.2)
         target = TASK.root_target(
             scene, None, RootTarget(start.qpos[:2], start.travel), jnp.array(4.0)

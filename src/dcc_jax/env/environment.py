@@ -31,6 +31,7 @@ from dcc_jax.motion.reference import References, RefState
 Array = jax.Array
 
 CONTROL_RATE = 30  # Hz, Sec. 5.1
+CROUCH_MARGIN = 0.1  # m, by which the pelvis may be lower than in the clips
 ALPHA_ENTRY = 270 + 36 + 4  # of the observation, where alpha is
 
 
@@ -68,14 +69,15 @@ class EnvConfig:
     """PD target a (+) u; without, a alone, as Sec. 4 can also be read."""
 
     fall_height: float = 0.55
-    """m; with the pelvis lower than this above the ground, the character has fallen."""
+    """m; with the pelvis lower than this above the ground, the character has fallen.
+    Where a clip goes lower, it may be lower by 0.1 m than any clip."""
 
     limb_clearance: float = 0.10
     """m; a body other than shins and feet whose origin comes so close to the ground has
     touched it."""
 
     clips: tuple[str, ...] = ()
-    """Paths of motion clips; empty: those of the package for this task."""
+    """Files `*.npz` or names of the package's clips; empty: the task's own choice."""
 
     compliance: ComplianceConfig = field(default_factory=ComplianceConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
@@ -178,6 +180,8 @@ class Environment:
         self.return_stiffness = compliance.return_stiffness(
             config.compliance, character.nv
         )
+        lowest = float(references.qpos[..., 2].min())
+        self.fall_height = min(config.fall_height, lowest - CROUCH_MARGIN)
         names = [character.body_names[i] for i in range(len(character.body_names))]
         self.limbs = np.array(
             [i for i, n in enumerate(names) if not n.endswith(("foot", "shin"))]
@@ -487,7 +491,7 @@ class Environment:
         )
         ground = self.task.ground_height(scene, state.task, state.body)
         pos_w, _ = features.body_poses(self.kinematics, q)
-        fallen = (q[2] < ground + config.fall_height) | jnp.any(
+        fallen = (q[2] < ground + self.fall_height) | jnp.any(
             pos_w[self.limbs, 2] < ground + config.limb_clearance
         )
         failed = self.task.terminated(scene, state.task, state.body)

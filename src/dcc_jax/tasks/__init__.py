@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dcc_jax.character import asset_path, load_character
@@ -9,6 +10,7 @@ from dcc_jax.env.environment import EnvConfig, Environment
 from dcc_jax.env.task import Task
 from dcc_jax.motion.clip import Clip, load_clip
 from dcc_jax.motion.reference import make_references
+from dcc_jax.tasks.backflip import Backflip
 from dcc_jax.tasks.ball import Ball
 from dcc_jax.tasks.chicken_fight import ChickenFight
 from dcc_jax.tasks.door import Door
@@ -26,6 +28,7 @@ TASKS: dict[str, type[Task]] = {
         Push,
         SustainedPush,
         Trampoline,
+        Backflip,
         HandInHand,
         ChickenFight,
         Door,
@@ -67,5 +70,11 @@ def make_environment(config: Config, task: Task | None = None) -> Environment:
 
 def _clips(task: Task, config: EnvConfig) -> list[Clip]:
     if config.clips:
-        return [load_clip(path) for path in config.clips]
-    return [load_clip(asset_path(f"motions/{name}.npz")) for name in task.clips]
+        return [load_clip(_clip_path(clip)) for clip in config.clips]
+    return [load_clip(_clip_path(clip)) for clip in task.clips]
+
+
+def _clip_path(clip: str) -> Path:
+    """A file `*.npz` where it is, any other name among the package's own clips."""
+    path = Path(clip)
+    return path if path.suffix == ".npz" else asset_path(f"motions/{clip}.npz")

@@ -65,7 +65,13 @@ class HandInHand(Task):
         "walk_left",
         "walk_right",
         "walk_cycle",
+        "jog",
+        "jog_left",
+        "jog_right",
+        "jog_cycle",
         "run",
+        "run_left",
+        "run_right",
         "run_cycle",
     )
     state_size: ClassVar[int] = 8

@@ -42,16 +42,16 @@ class Gaits:
     """What a partner does."""
 
     speeds: tuple[float, ...] = (0.0, 1.2, 2.0, 3.0)
-    """m/s; it stops, walks, jogs or runs."""
+    """m/s; it stops, walks, jogs or runs, as fast as the clips do."""
     leg_time: tuple[float, float] = (1.5, 3.5)
     """s for which it wants the same."""
     acceleration: float = 1.5
     """m/s^2, at most: a run begins within two seconds."""
-    turn_rate: float = 0.6
+    turn_rate: float = 0.5
     """rad/s, at most."""
     turn_acceleration: float = 1.5
     """rad/s^2, at most."""
-    sideways: float = 1.5
+    sideways: float = 1.0
     """m/s^2, at most, to the inside of a turn: a run turns less than a walk."""
 
 

@@ -41,6 +41,7 @@ class SustainedPush(Task):
         "stand",
         "balance",
         "walk_cycle",
+        "jog_cycle",
         "run_cycle",
     )
     clock: ClassVar[str | None] = "since_push"

@@ -3,11 +3,13 @@
 The fabric is a rigid plate with a spring-damper at each of its four corners, that is,
 one in height, roll and pitch. Every three seconds an upward force on the plate throws
 the character up. The contact forces of the feet are fed to the compliance for one
-second after each landing: absorb, then recover.
+second after each landing: absorb, then recover. A landing after all but a quarter of a
+turn in the air counts as a flip, once the character has stood it for that second.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -20,11 +22,13 @@ import numpy as np
 from dcc_jax import physics
 from dcc_jax.character import FEET, add_contact, sole_names
 from dcc_jax.env.task import Forces, Task, place_character, resultant
-from dcc_jax.motion.reference import RefState
+from dcc_jax.motion.reference import CONTROL_DT, RefState
 
 Array = jax.Array
 
 GRAVITY = 9.81
+PITCH = 4  # of the character's qvel: the pelvis turns forward about its left
+FLIP = 1.5 * np.pi  # rad
 HALF_SIZE, HALF_THICKNESS = 1.5, 0.05  # m
 
 
@@ -35,6 +39,9 @@ class State:
     next_bounce: Array  # [] s until the plate kicks; negative while it does
     airborne: Array  # [] s since a foot last touched the plate
     landed: Array  # [] s since the last landing
+    turned: Array  # [] rad, backwards, in this flight or the last one
+    flipping: Array  # [] bool, it has landed a flip and has to stand it yet
+    flips: Array  # [] how many it has stood
 
 
 @dataclass(frozen=True)
@@ -101,16 +108,32 @@ class Trampoline(Task):
             next_bounce=self.interval * jax.random.uniform(key),
             airborne=jnp.zeros(()),
             landed=jnp.full((), self.absorb_time),
+            turned=jnp.zeros(()),
+            flipping=jnp.zeros((), bool),
+            flips=jnp.zeros(()),
         )
         return state, qpos, qvel
 
     def control_step(
         self, key: Array, scene: physics.Scene, state: State, body: physics.State
     ) -> tuple[State, physics.State]:
-        """Counts down to the bounce."""
+        """Counts down to the bounce, and the turns of a flight."""
         over = state.next_bounce < -self.kick_time
         left = jnp.where(over, state.next_bounce + self.interval, state.next_bounce)
-        return state.replace(next_bounce=left - 1.0 / 30.0), body
+        pitch_rate = scene.character_qvel(body.qvel)[PITCH]
+        turned = jnp.where(
+            state.airborne > 0.0,
+            state.turned - CONTROL_DT * pitch_rate,
+            0.0,
+        )
+        stood = state.flipping & (state.landed >= self.absorb_time)
+        return dataclasses.replace(
+            state,
+            next_bounce=left - CONTROL_DT,
+            turned=turned,
+            flipping=state.flipping & ~stood,
+            flips=state.flips + stood,
+        ), body
 
     def applied(
         self, scene: physics.Scene, state: State, kin: physics.Kinematics, time: Array
@@ -139,6 +162,7 @@ class Trampoline(Task):
         state = state.replace(
             airborne=jnp.where(touching, 0.0, state.airborne + scene.timestep),
             landed=jnp.where(landing, 0.0, state.landed + scene.timestep),
+            flipping=state.flipping | (landing & (jnp.abs(state.turned) > FLIP)),
         )
         return state, Forces(
             force_w=force,
@@ -175,12 +199,15 @@ class Trampoline(Task):
     def evaluate(
         self, scene: physics.Scene, state: State, body: physics.State
     ) -> dict[str, Array]:
-        """`since_bounce` s since the last kick began, `plate_height` m, `in_flight`."""
+        """`since_bounce` s since the last kick began, `plate_height` m, `in_flight`,
+        `turned` rad backwards in the air, `flips` landed on the feet and stood."""
         to_come = state.next_bounce > 0.0
         return {
             "since_bounce": jnp.where(to_come, self.interval, 0.0) - state.next_bounce,
             "plate_height": self.ground_height(scene, state, body),
             "in_flight": state.airborne > self.flight_time,
+            "turned": state.turned,
+            "flips": state.flips,
         }
 
 
