@@ -156,6 +156,13 @@ def test_legs_stretch_in_every_step(motions, name):
     assert behind > 18.0  # degrees, the leg from vertical when it leaves the ground
 
 
+@pytest.mark.parametrize("name", [n for n in ALL if n.endswith("_cycle")])
+def test_the_pelvis_goes_evenly(motions, name):
+    """Less than recorded people do: legs that swing too early drag it to and fro."""
+    speed = np.linalg.norm(velocities(motions[name].clip)[:, :2], axis=1)
+    assert speed.std() < 0.27
+
+
 @pytest.mark.parametrize(
     ("name", "speed"),
     [

@@ -82,7 +82,7 @@ def stride_holds(
 
 
 def _leaving(foot: dict[str, float]) -> dict[str, float]:
-    names = ("push", "peel", "clearance", "early", "curl", "shed")
+    names = ("push", "peel", "clearance", "early", "curl", "lag", "shed")
     return {name: foot[name] for name in names if name in foot}
 
 

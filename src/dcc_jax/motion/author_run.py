@@ -40,6 +40,7 @@ RUN_FOOT = {
     "peel": 0.14,
     "early": 0.42,
     "curl": -0.5,
+    "lag": 0.12,
     "take": 0.03,
     "shed": 0.03,
 }

@@ -78,6 +78,7 @@ class Foothold:
     clearance: float = 0.05  # m, height of the swing that follows
     early: float = 0.5  # when in the swing it is highest
     curl: float = 0.0  # rad, more pitch in mid-swing
+    lag: float = 0.0  # share of the way by which it hangs back in mid-swing
     snap: float = 2.0  # least power of the rise: below 2 it leaves the ground quickly
 
     def pitch(self, t: np.ndarray) -> np.ndarray:
@@ -183,13 +184,15 @@ def swing(
         (out_pitch[1], np.diff(out_pitch)[0] / _EPS, 0.0),
         (in_pitch[0], np.diff(in_pitch)[0] / _EPS, 0.0),
     )
-    drive = DRIVE * (in_ankle[0] - out_ankle[1]) / span**2 * [1.0, 1.0, 0.0]
+    way = (in_ankle[0] - out_ankle[1]) * [1.0, 1.0, 0.0]
+    drive = DRIVE * way / span**2
     ankle = quintic(
         s,
         span,
         (out_ankle[1], (out_ankle[1] - out_ankle[0]) / _EPS, drive),
         (in_ankle[0], (in_ankle[1] - in_ankle[0]) / _EPS, -drive),
     )
+    ankle -= begin.lag * bump(s)[:, None] * way
     ankle[:, 2] += begin.clearance * bump(s, begin.early, begin.snap)
     pitch = pitch + begin.curl * bump(s, begin.early)
     return ankle, pitch, begin.yaw + (end.yaw - begin.yaw) * smoothstep(s)
