@@ -54,3 +54,10 @@ def test_reward_by_hand():
 def test_a_bad_weight_is_refused_by_name(value):
     with pytest.raises(ValueError, match="sigma_v"):
         rewards.RewardConfig(sigma_v=value)
+
+
+def test_tracking_reward_falls_with_the_squared_angles_of_all_joints():
+    error = jnp.zeros((2, 13, 3)).at[1, 4].set(jnp.array([0.3, 0.0, 0.4]))
+    error = error.at[1, 0, 2].set(0.5)
+    tracked = rewards.tracking_reward(error, CONFIG)
+    np.testing.assert_allclose(tracked, [1.0, np.exp(-2.0 * 0.5)], rtol=1e-6)

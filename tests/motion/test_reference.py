@@ -146,6 +146,14 @@ def test_initial_state_has_the_pose_of_one_control_step_ago(states):
     )
 
 
+def test_sampling_can_take_the_start_of_a_clip(refs):
+    keys = jax.random.split(jax.random.key(5), 20)
+    states = jax.vmap(lambda key: refs.sample(key, begin=True))(keys)
+    first = np.where(refs.loop[states.clip], 0.0, refs.control_dt)
+    np.testing.assert_allclose(states.time, first, atol=1e-6)
+    assert len(set(np.asarray(states.clip).tolist())) > 1
+
+
 def test_a_loop_travels_at_its_mean_velocity_and_other_clips_do_not(refs, states):
     # The chord of one period on the circle of 2 m, then turned by what it turns.
     chord, angle = 4.0 * np.sin(0.65), 0.65

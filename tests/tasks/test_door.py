@@ -122,18 +122,10 @@ def pulled(environment):
         body = physics.initial_state(scene, qpos, qvel)
         world = physics.default_world(scene).replace(equality_active=active[None])
         kin = physics.kinematics(scene, body, world)
-        return physics.solve(scene, kin, body, qfrc), TASK.forces(
-            scene,
-            door.State(
-                time=jnp.asarray(2.0),
-                holding=active,
-                orthogonal=jnp.zeros(()),
-                parallel=jnp.zeros(()),
-            ),
-            kin,
-            physics.solve(scene, kin, body, qfrc),
-            jnp.zeros(36),
-        )
+        solution = physics.solve(scene, kin, body, qfrc)
+        zero = jnp.zeros(())
+        state = door.State(jnp.asarray(2.0), active, zero, zero)
+        return solution, TASK.forces(scene, state, kin, solution, jnp.zeros(36))
 
     qpos, qvel = (np.stack(part) for part in zip(*rows, strict=True))
     solution, (state, forces) = jax.jit(jax.vmap(solved))(
@@ -232,6 +224,22 @@ def test_before_and_after_the_grip_the_door_rests(environment, seconds, angle):
     assert not bool(state.holding)
     np.testing.assert_allclose(qpos[joint.qposadr[0]], angle)
     assert float(qvel[joint.dofadr[0]]) == 0.0
+
+
+def test_an_evaluation_begins_beside_the_start_of_the_clip(character, environment):
+    config = EnvConfig(random_start=False)
+    first = Environment(TASK, character, environment.references, config)
+    keys = jax.random.split(jax.random.key(0), 8)
+    states = jax.jit(jax.vmap(first.reset))(keys)
+    np.testing.assert_allclose(states.task.time, 1 / 30, rtol=1e-5)
+    np.testing.assert_allclose(states.reference.time, 1 / 30, rtol=1e-5)
+    assert not np.asarray(states.task.holding).any()
+    beside = np.asarray(states.body.qpos[:, :2] - states.reference.qpos[:, :2])
+    assert 0.005 < np.abs(beside).max() <= TASK.start_radius + 1e-6
+    features = environment.feature_size
+    np.testing.assert_allclose(
+        states.obs[:, :features], np.tile(states.obs[0, :features], (8, 1)), atol=1e-4
+    )
 
 
 # The task in the environment.
