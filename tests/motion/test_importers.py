@@ -1,6 +1,7 @@
 """Importers: real files against known positions, and files nobody has seen."""
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import motion_files as files
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dcc_jax.motion import asf_amc
+from dcc_jax.motion import asf_amc, retarget
 from dcc_jax.motion.bvh import read_bvh
 from dcc_jax.motion.deepmimic import read_deepmimic
 from dcc_jax.motion.figure import figure, world_of
@@ -242,6 +243,32 @@ def test_the_exporter_does_not_matter(tmp_path, plain, changes):
     apart = to_rotation(world_of(clip.qpos)).inv() * to_rotation(world_of(plain.qpos))
     assert np.degrees(apart.magnitude()).max() < 0.1
     assert np.linalg.norm(joints(clip) - joints(plain), axis=-1).max() < 1e-3
+
+
+def test_a_foot_that_hangs_on_an_ankle_is_where_the_toes_begin(tmp_path, plain):
+    """As in SMPL: hip, knee, ankle, foot."""
+    text = files.bvh(prefix="")
+    for ours, theirs in (("ToeBase", "_Foot"), ("Foot", "_Ankle"), ("UpLeg", "_Hip")):
+        text = text.replace(f"Left{ours}\n", f"L{theirs}\n")
+        text = text.replace(f"Right{ours}\n", f"R{theirs}\n")
+    text = text.replace("LeftLeg\n", "L_Knee\n").replace("RightLeg\n", "R_Knee\n")
+    result = imported(tmp_path, text)
+    assert any("left_foot=L_Ankle" in note for note in result.notes)
+    assert np.linalg.norm(joints(result.clip) - joints(plain), axis=-1).max() < 1e-3
+
+
+def test_cleaning_that_makes_another_pose_of_it_is_not_used(tmp_path, monkeypatch):
+    """A crawl's upright feet, taken for stances, bent every leg by 120 degrees."""
+
+    def spoil(clip, standing):
+        return replace(clip, qpos=np.roll(clip.qpos, len(clip.qpos) // 4, axis=0))
+
+    copy = imported(tmp_path, files.bvh(), clean=False)
+    monkeypatch.setattr(retarget, "clean_feet", spoil)
+    monkeypatch.setattr(retarget, "WORST_POSE", 3.0)
+    result = imported(tmp_path, files.bvh())
+    assert any("feet left as they are" in note for note in result.notes)
+    np.testing.assert_array_equal(result.clip.qpos, copy.clip.qpos)
 
 
 def test_the_march_is_what_was_written(plain):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -69,7 +70,7 @@ def _add_import(parser: argparse.ArgumentParser) -> None:
     add("--trim", type=_span, metavar="A:B", help="seconds of the source to take")
     add("--loop", action="store_true", help="cut and close the best loop in it")
     add("--mirror", action="store_true", help="write the mirrored clip as well")
-    add("--low-pass", type=float, default=LOW_PASS, metavar="HZ", help="0: off (10)")
+    add("--low-pass", type=_cutoff, default=LOW_PASS, metavar="HZ", help="0: off (10)")
     add("--no-clean", action="store_true", help="leave the feet as they are")
     add("--name", help="name of the clip (the file's)")
     add("--label", help="the skill it shows")
@@ -78,9 +79,22 @@ def _add_import(parser: argparse.ArgumentParser) -> None:
 
 
 def _rate(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
     if not 1.0 <= value <= 1000.0:
-        raise argparse.ArgumentTypeError(f"{text} is not in [1, 1000] frames a second")
+        raise argparse.ArgumentTypeError(f"{text!r} is not in [1, 1000] frames/s")
+    return value
+
+
+def _cutoff(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0.0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither 0 nor a frequency in Hz")
     return value
 
 
@@ -231,7 +245,8 @@ def _draw(clip: Clip, arguments: argparse.Namespace) -> None:
         try:
             write(clip, path)
         except (ValueError, OSError) as error:
-            raise MotionError(path, f"cannot be written: {error}") from None
+            reason = getattr(error, "strerror", None) or str(error)
+            raise MotionError(path, f"cannot be written: {reason}") from None
         print(f"  wrote {path}")
 
 

@@ -43,7 +43,7 @@ def plot(clip: Clip, path: str | Path, *, fallback: bool | None = None) -> None:
     ending = Path(path).suffix.lstrip(".").lower()
     if ending not in canvas.get_supported_filetypes():
         known = ", ".join(sorted(canvas.get_supported_filetypes()))
-        raise ValueError(f"{path}: cannot write {ending!r} pictures, only {known}")
+        raise ValueError(f"cannot write {ending!r} pictures, only {known}")
     character = load_character()
     rows = page.add_gridspec(5, 4, height_ratios=[1.5, 1.2, 1, 1, 1])
     _plot_strip(page.add_subplot(rows[0, :]), clip, fallback)

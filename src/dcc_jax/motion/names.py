@@ -165,6 +165,21 @@ def _guess_sides(motion: Motion, plain: list[str], bodies: dict[str, int]) -> No
             )
             if node is not None:
                 bodies[f"{side}_{part}"] = node
+    for side in _SPELLED:
+        _prefer_ankle(motion, plain, bodies, side)
+
+
+def _prefer_ankle(
+    motion: Motion, plain: list[str], bodies: dict[str, int], side: str
+) -> None:
+    """Where a `foot` hangs on an `ankle`, as in SMPL, it is where the toes begin."""
+    foot = bodies.get(f"{side}_foot")
+    if foot is None:
+        return
+    above = motion.ancestors(foot)[1:2]
+    if above and "ankle" in plain[above[0]]:
+        bodies[f"{side}_foot"] = above[0]
+        bodies.setdefault(f"{side}_toe", foot)
 
 
 def _guess_middle(motion: Motion, plain: list[str], bodies: dict[str, int]) -> None:
@@ -200,7 +215,7 @@ def _check_order(motion: Motion, bodies: Mapping[str, int]) -> None:
     Raises:
         MotionError: a body's node does not hang on that of its parent body.
     """
-    chains = [("pelvis", "chest", "head")]
+    chains: list[tuple[str, ...]] = [("pelvis", "chest", "head")]
     for side in _SPELLED:
         chains.append(("pelvis", f"{side}_thigh", f"{side}_shin", f"{side}_foot"))
         chains.append(("pelvis", f"{side}_upper_arm", f"{side}_forearm"))

@@ -28,6 +28,7 @@ from dcc_jax.motion.skeleton import Motion, leg_length
 LOW_PASS = 10.0  # Hz, for what was recorded faster than 60 Hz
 WORK_FPS = 60.0  # frame rate for cleaning, where the wanted one divides it
 OWN_DIRECTION = math.radians(10.0)  # a bone off its limb by more is aligned by itself
+WORST_POSE = 8.0  # degrees of mean pose error; standing feet ask for less than 3
 SPREAD = math.radians(12.0)  # legs spread further have feet square to them
 
 
@@ -72,7 +73,8 @@ def retarget(
     level, slope = on_level_ground(work)
     if slope:
         notes = (*notes, f"took out a slope of {100.0 * slope:.1f} %")
-    return replace(finish(level, fps, clean), slope=slope, notes=notes)
+    result = finish(level, fps, clean)
+    return replace(result, slope=slope, notes=(*notes, *result.notes))
 
 
 def finish(level: Clip, fps: float, clean: bool) -> Retargeted:
@@ -87,11 +89,17 @@ def finish(level: Clip, fps: float, clean: bool) -> Retargeted:
     if level.loop:
         result = replace(result, qpos=closed(result.qpos))
     error = pose_error(result, world_of(level.qpos))
+    notes: tuple[str, ...] = ()
+    if error > WORST_POSE:
+        notes = (
+            f"feet left as they are: cleaning would turn limbs by {error:.0f} deg",
+        )
+        result, error = level, 0.0
     stances = _thinned(standing[middle], level, fps)
     before = measure(clips.resample(level, fps), stances)
     result = clips.resample(result, fps)
     after = measure(result, stances)
-    return Retargeted(placed(result), before, after, error, 0.0, ())
+    return Retargeted(placed(result), before, after, error, 0.0, notes)
 
 
 def _thinned(standing: np.ndarray, clip: Clip, fps: float) -> np.ndarray:
