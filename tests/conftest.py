@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
 from dcc_jax import runtime
 
 runtime.setup()
@@ -19,6 +23,14 @@ jax.config.update("jax_debug_key_reuse", True)
 @pytest.fixture(scope="session")
 def character() -> Character:
     return load_character()
+
+
+@pytest.fixture(scope="session")
+def smoke_run(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """(task) -> the run directory of a policy trained for two updates, made once."""
+    import smoke
+
+    return cache(lambda task: smoke.smoke_run(task, tmp_path_factory))
 
 
 @pytest.fixture(scope="session")

@@ -193,15 +193,15 @@ class Player:
     ) -> tuple[EnvState, Frame, Array]:
         """CHUNK control steps of all environments of a device."""
 
-        def step(state: EnvState, keys: Array) -> tuple[EnvState, Frame]:
+        def step(state: EnvState, time: Array) -> tuple[EnvState, Frame]:
             action = policy.mean(state.obs.at[:, ALPHA_ENTRY].set(told))
-            new, forces = jax.vmap(self.environment.recorded_step)(keys, state, action)
+            draws = jax.vmap(lambda key: jax.random.fold_in(key, time))(keys)
+            new, forces = jax.vmap(self.environment.recorded_step)(draws, state, action)
             return new, jax.vmap(self._frame)(state, new, forces)
 
-        def draws(key: Array) -> Array:
-            return jax.random.split(jax.random.fold_in(key, chunk + 1), CHUNK)
-
-        state, frames = jax.lax.scan(step, state, jax.vmap(draws)(keys).T)
+        # Zero is the key of the reset.
+        times = 1 + CHUNK * chunk + jnp.arange(CHUNK)
+        state, frames = jax.lax.scan(step, state, times)
         pairs = self.environment.style_coordinates(
             state.previous_features, state.features
         )

@@ -1,0 +1,117 @@
+"""Distances to the clips: hand numbers, closed forms, scipy."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from toy import Toy
+
+from dcc_jax.env.pairs import COLUMN_ARM, VELOCITY_TIME, pair_coordinates
+from dcc_jax.learn import style
+
+DT = 1.0 / 30.0
+
+
+@pytest.fixture(scope="module")
+def reference() -> style.Reference:
+    """The pairs of the toy's clips: four numbers, correlated."""
+    return jax.jit(lambda: style.make_reference(Toy()))()
+
+
+def _clip_pairs(seed: int, count: int) -> jax.Array:
+    s, s_next, _ = Toy().expert_pairs(jax.random.key(seed), count)
+    return Toy().style_coordinates(s, s_next)
+
+
+def test_pairs_of_the_clips_are_on_themselves(reference):
+    np.testing.assert_allclose(
+        style.nearest(reference, reference.pairs[:50]), 0.0, atol=1e-3
+    )
+
+
+def test_nearest_is_that_of_all_distances(reference):
+    points = 2.0 * _clip_pairs(1, 40) + 0.3
+    apart = np.asarray(points)[:, None] - np.asarray(reference.pairs)
+    expected = np.linalg.norm(apart, axis=-1).min(axis=1)
+    np.testing.assert_allclose(style.nearest(reference, points), expected, atol=1e-4)
+
+
+def test_frechet_distance_of_shifted_clips_is_the_shift(reference):
+    shift = jnp.array([0.3, 0.0, -0.4, 0.0])
+    moved = reference.pairs + shift
+    ones = jnp.ones(len(moved))
+    assert float(style.frechet(reference, moved, ones)) == pytest.approx(0.5, rel=1e-3)
+    assert float(style.frechet(reference, reference.pairs, ones)) < 1e-3
+
+
+def test_frechet_distance_is_that_of_the_matrix_square_root(reference):
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(300, 4)) @ rng.normal(size=(4, 4)) + 0.1
+    weight = rng.integers(0, 3, size=300)
+    counted = np.repeat(points, weight, axis=0)
+    first = np.cov(np.asarray(reference.pairs, float).T, bias=True)
+    second = np.cov(counted.T, bias=True)
+    gap = counted.mean(0) - np.asarray(reference.pairs).mean(0)
+    cross = scipy.linalg.sqrtm(first @ second).real
+    expected = np.sqrt(gap @ gap + np.trace(first + second - 2.0 * cross))
+    found = style.frechet(reference, jnp.array(points), jnp.array(weight, jnp.float32))
+    assert float(found) == pytest.approx(expected, rel=1e-3)
+
+
+def test_fewer_kinds_of_motion_show_in_the_frechet_distance_alone(reference):
+    """A policy that stays in one place of the clips does nothing wrong, but little."""
+    all_of_it = _clip_pairs(5, 500)
+    middle = all_of_it[jnp.linalg.norm(all_of_it, axis=1) < 0.15]
+    whole, part = (
+        style.measure(reference, points, jnp.ones(len(points)))
+        for points in (all_of_it, middle)
+    )
+    assert float(part["style/nearest"]) <= float(whole["style/nearest"])
+    assert float(part["style/frechet"]) > 3.0 * float(whole["style/frechet"])
+
+
+def test_environments_that_were_just_reset_do_not_count():
+    pairs = _clip_pairs(2, 8)
+    env = SimpleNamespace(
+        previous_features=pairs[:, :2].at[0].set(100.0), features=pairs[:, 2:]
+    )
+    steps = jnp.array([0, 1, 2, 3, 4, 5, 6, 7])
+    measured = style.of_running(Toy(), SimpleNamespace(env=env, steps=steps))
+    assert all(float(value) < 0.3 for value in measured.values())
+
+
+def _features(position: np.ndarray, before: np.ndarray, columns: np.ndarray):
+    """[270] of bodies at positions [15, 3] now and then, one turn for all [6]."""
+    turn = np.broadcast_to(columns, (15, 6))
+    return jnp.array(np.concatenate([position, before, turn, turn], 1).ravel())
+
+
+def test_pair_moved_as_a_whole_is_as_far_away():
+    rng = np.random.default_rng(1)
+    at, turn = rng.normal(size=(15, 3)), rng.normal(size=6)
+    here = _features(at, at, turn)
+    moved = at + np.array([0.0, 0.03, 0.04])
+    aside = _features(moved, moved, turn)
+    gap = pair_coordinates(here, here, DT) - pair_coordinates(aside, aside, DT)
+    assert gap.shape == (225,)
+    assert float(jnp.linalg.norm(gap)) == pytest.approx(0.05, rel=1e-4)
+
+
+def test_speed_and_turn_count_as_the_constants_say():
+    at, turn = np.zeros((15, 3)), np.zeros(6)
+    rest = _features(at, at, turn)
+    moving = _features(at, at - [DT, 0.0, 0.0], turn)  # 1 m/s
+    turned = _features(at, at, np.eye(6)[0])
+    standing = pair_coordinates(rest, rest, DT)
+    for pair, expected in (
+        ((rest, moving), VELOCITY_TIME),
+        ((moving, rest), VELOCITY_TIME),
+        ((rest, turned), COLUMN_ARM),
+    ):
+        gap = pair_coordinates(*pair, DT) - standing
+        assert float(jnp.linalg.norm(gap)) == pytest.approx(expected, rel=1e-4)

@@ -1,0 +1,245 @@
+"""Evaluation of a policy that was hardly trained: pairs, physics, output, bad input."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from dcc_jax.evaluate import report, runs
+from dcc_jax.evaluate.episodes import Player, Recording
+from dcc_jax.tasks.push import Push
+
+# The package shows the function of that name; these tests want the module.
+command = importlib.import_module("dcc_jax.evaluate.__main__")
+
+EPISODES, SECONDS, GRAVITY = 8, 1.5, 9.81
+Seen = tuple[Player, Recording, report.Report]
+
+
+@pytest.fixture(scope="module")
+def push(smoke_run: Callable[[str], Path]) -> Path:
+    return smoke_run("push")
+
+
+@pytest.fixture(scope="module")
+def plan(push: Path) -> report.Plan:
+    """Two levels of compliance of one policy; its program serves the whole file."""
+    return report.prepare(push, EPISODES, None, 3, SECONDS, None, lambda text: None)
+
+
+@pytest.fixture(scope="module")
+def found(plan: report.Plan) -> report.Report:
+    return report.execute(plan, lambda done, total: None)
+
+
+def _trained_at(run: runs.Run, alpha: float) -> runs.Run:
+    """The policy as if it had been trained at one level, which it then observes."""
+    env = dataclasses.replace(run.config.env, alpha=alpha, alpha_max=None)
+    return dataclasses.replace(run, config=dataclasses.replace(run.config, env=env))
+
+
+def _play(plan: report.Plan, alpha: float) -> Recording:
+    run, _ = plan.conditions[0]
+    return plan.players[run.name].play(
+        _trained_at(run, 0.16),
+        range(EPISODES),
+        [alpha] * EPISODES,
+        seed=3,
+        seconds=SECONDS,
+        motion=True,
+    )
+
+
+@pytest.fixture(scope="module")
+def recordings(plan: report.Plan) -> tuple[Recording, Recording]:
+    """At alpha = 0 and at the largest there is, where the difference shows."""
+    return _play(plan, 0.0), _play(plan, 1.0)
+
+
+def test_levels_of_compliance_meet_the_same_balls(recordings):
+    rigid, yielding = (r.motion.qpos for r in recordings)
+    np.testing.assert_array_equal(rigid[0, :, 55:], yielding[0, :, 55:])
+    # Up to the first contact the episodes are the same; a ball tells them apart.
+    forces = [r.numbers["contact_share"].cumsum(axis=0) > 0 for r in recordings]
+    untouched = ~forces[0] & ~forces[1]
+    assert untouched.sum() > 50
+    np.testing.assert_array_equal(rigid[untouched], yielding[untouched])
+    hit = forces[0] & recordings[0].alive & recordings[1].alive
+    assert np.abs(rigid[hit] - yielding[hit]).max() > 1e-5
+    assert recordings[0].numbers["displacement"].max() < 1e-5
+    assert recordings[1].numbers["displacement"][hit].max() > 1e-4
+
+
+def test_episodes_differ_and_depend_on_the_seed_alone(plan, recordings):
+    again = _play(plan, 0.0)
+    first = recordings[0].motion.qpos
+    np.testing.assert_array_equal(again.motion.qpos, first)
+    assert len({row.tobytes() for row in first[0]}) == EPISODES
+
+
+def test_impulse_of_a_contact_is_what_the_ball_lost(plan, recordings):
+    """Newton's third law: 1 kg times the change of the ball's velocity."""
+    run, _ = plan.conditions[0]
+    model = plan.players[run.name].environment.scene.model
+    start = int(model.joint("ball").qposadr[0])
+    ball, dt = recordings[0].motion.qpos[..., start : start + 3], 1.0 / 30.0
+    down = np.array([0.0, 0.0, GRAVITY])
+    compared = []
+    for n in range(EPISODES):
+        share = recordings[0].numbers["contact_share"][:, n]
+        edges = np.diff(np.pad(share > 0, 1).astype(int))
+        spans = zip(
+            np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True
+        )
+        for a, b in spans:
+            throws = np.linalg.norm(np.diff(ball[:, n], axis=0), axis=1) > 0.3
+            if a < 3 or b + 1 >= len(share) or throws[a - 3 : b + 1].any():
+                continue
+            before = (ball[a - 1, n] - ball[a - 2, n]) / dt - 0.5 * dt * down
+            after = (ball[b, n] - ball[b - 1, n]) / dt + 0.5 * dt * down
+            lost = np.linalg.norm(after - before + (b - a) * dt * down)
+            impulse = recordings[0].numbers["impulse"][a:b, n].sum()
+            compared.append((impulse, lost))
+    impulse, lost = np.array(compared).T
+    assert len(compared) >= 3
+    assert (lost > 0.5).all()
+    np.testing.assert_allclose(np.median(impulse / lost), 1.0, atol=0.1)
+
+
+def test_same_policy_under_two_names_gives_the_same_rows(push, tmp_path):
+    other = tmp_path / "other"
+    other.mkdir()
+    for name in ("policy.npz", "config.json"):
+        shutil.copy(push / name, other / name)
+    twice = report.prepare(
+        [push, other], EPISODES, [0.16], 3, SECONDS, None, lambda text: None
+    )
+    assert len({id(player) for player in twice.players.values()}) == 1
+    assert [run.name for run, _ in twice.conditions] == [str(push), str(other)]
+
+
+def test_report_has_a_row_an_episode_and_a_comparison_of_the_levels(found):
+    assert [c.alpha for c in found.conditions] == [0.0, 0.16]
+    assert len(found.rows) == 2 * EPISODES
+    assert {row["episode"] for row in found.rows} == set(range(EPISODES))
+    (comparison,) = found.comparisons
+    assert (comparison.condition, comparison.baseline) == (1, 0)
+    peaks = [row["contact/peak"] for row in found.rows]
+    for i, part in enumerate(np.split(np.array(peaks), 2)):
+        mean = found.summary[i]["contact/peak"]
+        assert mean.value == pytest.approx(np.nanmean(part))
+        assert mean.low <= mean.value <= mean.high
+    listed = [c["peak"] for c in found.contacts if c["alpha"] == 0.0]
+    assert found.summary[0]["contact/peak_max"].value == max(listed)
+    assert found.summary[0]["broken"].value == 0.0
+    assert found.summary[0]["style/frechet"].value > 0.0
+    assert found.clock == "since_throw"
+    assert "task/speed/mean" in found.rows[0]
+
+
+def test_json_and_figure_are_written_and_the_table_is_printed(
+    found, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(report, "prepare", lambda *args: None)
+    monkeypatch.setattr(report, "execute", lambda plan, progress: found)
+    paths = {name: tmp_path / "new" / name for name in ("a.json", "a.png")}
+    argv = ["RUN", "--json", str(paths["a.json"]), "--figure", str(paths["a.png"])]
+    assert command.main(argv) == 0
+    text = capsys.readouterr().out
+    for part in ("alpha 0.16 / alpha 0", "contact/peak (N)", "survived (s)"):
+        assert part in text
+    data = json.loads(paths["a.json"].read_text(), parse_constant=pytest.fail)
+    assert len(data["rows"]) == 2 * EPISODES
+    assert data["summary"][0]["fell"].keys() == {"value", "low", "high"}
+    picture = imread(paths["a.png"])
+    assert picture.shape[0] > 500 and picture[..., :3].std() > 0.05
+
+
+def test_policy_is_told_an_alpha_it_knows(push):
+    said: list[str] = []
+    known = _trained_at(runs.find_run(push), 0.16)
+    assert known.alphas == (0.16, 0.16)
+    assert report._levels(known, None, said.append) == [0.16]
+    assert not said
+    assert report._levels(known, [0.0, 0.16], said.append) == [0.0, 0.16]
+    assert "trained at alpha 0.16: at 0 its policy" in said[0]
+
+
+def test_task_with_other_parameters_takes_the_place_of_the_configured_one(push):
+    environment = runs.make_environment(runs.find_run(push), Push(mass=4.0))
+    model = environment.scene.model
+    assert model.body("ball").mass[0] == pytest.approx(4.0)
+    assert environment.config.episode_seconds > 3600.0
+
+
+def _damaged(push: Path, folder: Path) -> Path:
+    (folder / "config.json").write_text((push / "config.json").read_text())
+    (folder / "policy.npz").write_bytes((push / "policy.npz").read_bytes()[:900])
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("argv", "parts"),
+    [
+        ([], ["RUN_DIR"]),
+        (["/none/here"], ["/none/here is not a run directory"]),
+        (["{push}", "--episodes", "0"], ["episodes must be 1 or more, got 0"]),
+        (["{push}", "--episodes", "many"], ["--episodes", "many"]),
+        (["{push}", "--alpha", "1.5"], ["alpha must be in [0, 1], got 1.5"]),
+        (["{push}", "--alpha", "0.1", "0.1"], ["alpha must be different"]),
+        (["{push}", "--seconds", "0"], ["seconds must be in", "got 0.0"]),
+        (["{push}", "--seed", "-1"], ["seed must be", "-1"]),
+        (["{push}", "--figure", "a.doc"], ["'doc'", "png"]),
+        (["{push}", "{push}"], ["a run is given twice"]),
+        (["{damaged}"], ["policy.npz is damaged"]),
+        (["{empty}"], ["is not a run directory: no config.json"]),
+        (["{other}"], ["task must be one of", "'fly'"]),
+        (["{smaller}"], ["20 observations", "push has"]),
+        (["{push}", "--bogus"], ["--bogus"]),
+    ],
+)
+def test_bad_input_is_one_line_and_status_two(argv, parts, push, tmp_path, capsys):
+    made = {"push": push}
+    for name in ("damaged", "empty", "other", "smaller"):
+        made[name] = tmp_path / name
+        made[name].mkdir()
+    _damaged(push, made["damaged"])
+    config = json.loads((push / "config.json").read_text())
+    for name in ("other", "smaller"):
+        shutil.copy(push / "policy.npz", made[name])
+        changed = config | ({"task": "fly"} if name == "other" else {})
+        (made[name] / "config.json").write_text(json.dumps(changed))
+    with np.load(made["smaller"] / "policy.npz") as archive:
+        arrays = dict(archive)
+    arrays["params.0.kernel"] = arrays["params.0.kernel"][:20]
+    np.savez(made["smaller"] / "policy.npz", **arrays)
+    assert command.main([part.format(**made) for part in argv]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    for part in parts:
+        assert part in lines[0]
+
+
+def test_error_nobody_foresaw_is_one_line_with_details_in_a_file(
+    monkeypatch, capsys, tmp_path
+):
+    def fail(plan: object, progress: object) -> None:
+        raise ZeroDivisionError("one over zero\nand more")
+
+    monkeypatch.setattr(report, "prepare", lambda *args: None)
+    monkeypatch.setattr(report, "execute", fail)
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    assert command.main(["RUN"]) == 1
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "ZeroDivisionError: one over zero" in line
+    (log,) = tmp_path.iterdir()
+    assert str(log) in line and "and more" in log.read_text()
