@@ -55,7 +55,8 @@ class Scene:
     mjx_model: mjx.Model  # on the device; constants of the compiled program
     template: mjx.Data  # constant: every step starts from it, only `State` is carried
     contact_bodies: np.ndarray  # [C, 2] body ids; the force acts on the second
-    arrow: Arrow  # where the matrices of the solver can be non-zero
+    arrow: Arrow  # where the matrices of the contact solver can be non-zero
+    mass_arrow: Arrow  # where the mass matrix alone can
 
     @property
     def timestep(self) -> float:
@@ -131,6 +132,7 @@ def make_scene(
         template=template,
         contact_bodies=contact_bodies,
         arrow=arrow(model, _row_pattern(model, contact_bodies)),
+        mass_arrow=arrow(model, np.zeros((0, model.nv), bool)),
     )
 
 
@@ -320,5 +322,5 @@ def mass_solve(scene: Scene, kin: Kinematics, qfrc: Array) -> Array:
     dynamics is linear in the external force.
     """
     mass = mjx.full_m(scene.mjx_model, kin.data) - jnp.diag(scene.spd_diagonal)
-    solved = solve_mass(scene.arrow, mass, jnp.atleast_2d(qfrc))
+    solved = solve_mass(scene.mass_arrow, mass, jnp.atleast_2d(qfrc))
     return solved.reshape(qfrc.shape)

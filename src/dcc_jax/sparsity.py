@@ -10,8 +10,9 @@ H = M + J^T D J of the contact solver have the shape of an arrow,
     [   x        x      x  core],
 
 and factor without fill-in, limbs of one size side by side (`solver`). The core are the
-degrees of freedom above a fork of the tree, and those of everything that has no fork:
-a ball, a plate, a door. Everything here is static: numpy, computed once a scene.
+degrees of freedom above a fork of the tree, and those of whatever has no fork and
+touches something: a ball, a plate, a door. Everything here is static: numpy, computed
+once a scene.
 """
 
 from __future__ import annotations
@@ -60,8 +61,8 @@ def arrow(model: mujoco.MjModel, row_pattern: np.ndarray) -> Arrow:
         row_pattern: [R, nv] bool, where the rows of J can be non-zero.
     """
     related = _related(model)
-    is_core = _is_core(related)
     coupled = related | (row_pattern.T.astype(int) @ row_pattern.astype(int) > 0)
+    is_core = _is_core(related, coupled)
     limbs = _components(coupled, np.flatnonzero(~is_core))
     core = np.flatnonzero(is_core)
     nowhere = model.nv**2
@@ -127,15 +128,17 @@ def _related(model: mujoco.MjModel) -> np.ndarray:
     return related | related.T
 
 
-def _is_core(related: np.ndarray) -> np.ndarray:
-    """[nv] above a fork, or of a tree that has none."""
+def _is_core(related: np.ndarray, coupled: np.ndarray) -> np.ndarray:
+    """[nv] above a fork, or of a tree that has none and is coupled with another."""
     nv = len(related)
     below = np.tril(related)  # [i, j]: j is i or an ancestor of i
     leaf = below.sum(axis=0) == 1
     leaves_below = below[leaf].sum(axis=0)
     tree = np.array([np.flatnonzero(related[i])[0] for i in range(nv)])
     leaves_of_tree = np.array([leaf[tree == root].sum() for root in tree])
-    return (leaves_below > 1) | (leaves_of_tree == 1)
+    touches = (coupled & (tree[:, None] != tree)).any(axis=1)
+    touches_of_tree = np.array([touches[tree == root].any() for root in tree])
+    return (leaves_below > 1) | ((leaves_of_tree == 1) & touches_of_tree)
 
 
 def _components(coupled: np.ndarray, dofs: np.ndarray) -> list[np.ndarray]:
