@@ -3,6 +3,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+# `make run`: about five minutes of learning on two cores.
+RUN := runs/trampoline-$(shell date +%Y%m%d-%H%M%S)
+TUPLES := 1228800
 
 .PHONY: setup run test test-all check clean
 
@@ -15,7 +18,10 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $(STAMP)
 
 run: setup
-	$(BIN)/python -m dcc_jax.train --task trampoline --preset smoke --run-dir runs/first
+	$(BIN)/python -m dcc_jax.train --task trampoline --train.total-tuples $(TUPLES) --run-dir $(RUN)
+	$(BIN)/python -m dcc_jax.render $(RUN) --seconds 6 --out $(RUN)/policy.mp4
+	@echo "curves: $(RUN)/curves.png   video: $(RUN)/policy.mp4   go on: \
+	$(BIN)/python -m dcc_jax.train --task trampoline --resume --run-dir $(RUN)"
 
 test: setup
 	$(BIN)/python -m pytest -n auto --dist loadfile
