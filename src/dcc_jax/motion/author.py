@@ -131,10 +131,11 @@ def as_clip(solved: Solved, name: str, recipe: Recipe) -> Clip:
 
 
 def _closed(qpos: np.ndarray) -> np.ndarray:
-    """The same with the last frame of a loop equal to the first one, joints and height.
+    """The same from the origin, the last frame equal to the first, joints and height.
 
     Periodic plans agree there to the accuracy of the solution already.
     """
     qpos = qpos.copy()
+    qpos[:, :2] -= qpos[0, :2]
     qpos[-1, 2], qpos[-1, 7:] = qpos[0, 2], qpos[0, 7:]
     return qpos

@@ -118,14 +118,12 @@ def lack_of_reach(solved: Solved) -> np.ndarray:
     need = (standing * np.maximum(solved.distance - SOFT_REACH, 0.0)).max(1)
     frames = len(need)
     stiff = (LOWER_TIME / plan.dt) ** 2 * np.where(plan.flight[1:-1], 100.0, 1.0)
-    second = diags_array(
-        [stiff, -2.0 * stiff, stiff], offsets=[0, 1, 2], shape=(frames - 2, frames)
-    )
+    second = diags_array(stiff) @ _steps(frames - 1) @ _steps(frames)
     system = (second.T @ second + eye_array(frames)).tocsc()
-    active = need > 0.0
+    active, lower = need > 0.0, need
     for _ in range(100):
         bound = diags_array(np.where(active, 1e8, 0.0))
-        lower = spsolve((system + bound).tocsc(), bound @ need)
+        lower = np.asarray(spsolve((system + bound).tocsc(), bound @ need))
         guess = np.where(active, system @ lower > 0.0, lower < need - 1e-9)
         if (guess == active).all():
             break
@@ -215,7 +213,8 @@ def _drawn_in(ankles: np.ndarray, hips: np.ndarray, plan: Plan) -> np.ndarray:
 
 def _freedom(contact: np.ndarray, dt: float, ease: float) -> np.ndarray:
     """[T] 0 on the ground, 1 when the foot is more than `ease` s away from it."""
-    return np.minimum(distance_transform_edt(~contact) * dt / ease, 1.0)
+    frames = np.asarray(distance_transform_edt(~contact))
+    return np.minimum(frames * dt / ease, 1.0)
 
 
 def _foot_headings(plan: Plan) -> np.ndarray:
@@ -248,10 +247,9 @@ def conserving_turn(state: Momentum, plan: Plan, turn: np.ndarray) -> np.ndarray
     small against the weight carried times `LEVER`; the turn is small and smooth.
     """
     frames, dt = len(plan.height), plan.dt
-    away = distance_transform_edt(~plan.flight) * dt
+    away = np.asarray(distance_transform_edt(~plan.flight)) * dt
     close = away < NEAR
-    step = diags_array([-np.ones(frames), np.ones(frames - 1)], offsets=[0, 1]) / dt
-    rate = kron(step.tocsr()[:-1], eye_array(3)).tocsr()
+    rate = kron(_steps(frames) / dt, eye_array(3))
     middle = 0.5 * (state.inertia[1:] + state.inertia[:-1])
     blocks = _block_diagonal(middle) @ rate
     inner = np.flatnonzero(close[1:-1]) + 1
@@ -261,13 +259,18 @@ def conserving_turn(state: Momentum, plan: Plan, turn: np.ndarray) -> np.ndarray
     weight = np.repeat((1.0 - away[inner] / NEAR) / (0.2 + LEVER * force), 3)
     hold = diags_array(weight) @ (blocks[before + 3] - blocks[before]) / dt
     want = -weight * (spin[before + 3] - spin[before]) / dt
-    second = kron((step.T @ step).tocsr()[1:-1], eye_array(3))
+    second = kron(_steps(frames - 1) @ _steps(frames) / dt**2, eye_array(3))
     keep = np.interp(away, [0.0, NEAR], [10.0, 30.0])
     system = vstack([hold, 0.02 * second, diags_array(np.repeat(keep, 3))]).tocsr()
     back = -(np.where(plan.flight, 0.0, keep)[:, None] * turn).ravel()
-    right = np.concatenate([want, np.zeros(second.shape[0]), back])
-    answer = spsolve((system.T @ system).tocsc(), system.T @ right)
+    right = np.concatenate([want, np.zeros(3 * frames - 6), back])
+    answer = np.asarray(spsolve((system.T @ system).tocsc(), system.T @ right))
     return answer.reshape(frames, 3)
+
+
+def _steps(frames: int):
+    """Sparse matrix [T - 1, T] that takes each frame from the next."""
+    return eye_array(frames - 1, frames, k=1) - eye_array(frames - 1, frames)
 
 
 def _block_diagonal(blocks: np.ndarray):

@@ -30,9 +30,12 @@ def home(side: int, **changes: float) -> Foothold:
     return replace(Foothold(-0.02, sign * HOME_WIDTH, sign * TOE_OUT), **changes)
 
 
-def _waves(t: np.ndarray, parts: list[tuple[float, int, float]], period: float):
+def _waves(
+    t: np.ndarray, parts: list[tuple[float, int, float]], period: float
+) -> np.ndarray:
     """Sum of sines (amplitude, cycles a period, phase)."""
-    return sum(a * np.sin(2 * np.pi * n * t / period + shift) for a, n, shift in parts)
+    waves = [a * np.sin(2 * np.pi * n * t / period + shift) for a, n, shift in parts]
+    return np.sum(waves, axis=0)
 
 
 def stand(period: float = 10.0) -> Solved:
@@ -97,7 +100,8 @@ def recovery(direction: float, reach: float = 0.36) -> Solved:
     alert = ramp(t, 0.3, 0.8) * (1.0 - ramp(t, end - 0.9, end))
     height = stand_height() - 0.035 * alert
     out_angle = 0.15 + 0.30 * alert
-    limbs = arms(0.15 * alert, 0.15 * alert, out_angle, *[0.26 + 0.4 * alert] * 2)
+    bent = 0.26 + 0.4 * alert
+    limbs = arms(0.15 * alert, 0.15 * alert, out_angle, bent, bent)
     return solve(gait_plan(t, holds, height, Style(), limbs=limbs))
 
 

@@ -249,7 +249,7 @@ def _world_axes(
         return rest_axes, ()
     else:
         upward = _nearest_axis(trunk)
-    turn, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [rest_axes @ upward])
+    turn = Rotation.align_vectors([[0.0, 0.0, 1.0]], [rest_axes @ upward])[0]
     world = turn.as_matrix() @ rest_axes
     if np.allclose(world, rest_axes):
         return rest_axes, ()
