@@ -84,18 +84,19 @@ def draw(points: list[dict], out: Path) -> None:
     )
     for place, (name, title) in zip(axes, (CURVES | BARS).items(), strict=True):
         for p in (p for p in points if p["name"] == name):
-            label = f"alpha = {p['alpha']:g}"
             if name in CURVES:
+                label = f"alpha = {p['alpha']:g}"
                 time, mean, half = (np.array(p[k]) for k in ("seconds", "mean", "half"))
                 place.plot(time, mean, label=label)
                 place.fill_between(time, mean - half, mean + half, alpha=0.2, lw=0.0)
                 continue
             bars = [[p["value"] - p["low"]], [p["high"] - p["value"]]]
-            place.errorbar([label], [p["value"]], bars, marker="o", capsize=3)
+            place.errorbar(
+                [f"{p['alpha']:g}"], [p["value"]], bars, marker="o", capsize=3
+            )
         place.set_title(title, fontsize=10)
         place.grid(alpha=0.3)
-        if name in CURVES:
-            place.set_xlabel("s since the bounce")
+        place.set_xlabel("s since the bounce" if name in CURVES else "alpha")
     axes[0].legend()
     figure.tight_layout()
     figure.savefig(out, dpi=120)

@@ -75,7 +75,7 @@ def write(out: Path, rows: list[dict], points: list[dict]) -> None:
     """
     out.parent.mkdir(parents=True, exist_ok=True)
     with out.with_suffix(".csv").open("w", newline="") as file:
-        table = csv.DictWriter(file, rows[0])
+        table = csv.DictWriter(file, rows[0] if rows else [])
         table.writeheader()
         table.writerows(rows)
     text = json.dumps(points, indent=1)

@@ -9,12 +9,16 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from dcc_jax.env.environment import ALPHA_ENTRY
 from dcc_jax.evaluate import report, runs
-from dcc_jax.evaluate.episodes import Player, Recording
+from dcc_jax.evaluate.episodes import Player
+from dcc_jax.evaluate.recording import Recording
 from dcc_jax.tasks.push import Push
 
 # The package shows the function of that name; these tests want the module.
@@ -161,6 +165,16 @@ def test_json_and_figure_are_written_and_the_table_is_printed(
     assert data["summary"][0]["fell"].keys() == {"value", "low", "high"}
     picture = imread(paths["a.png"])
     assert picture.shape[0] > 500 and picture[..., :3].std() > 0.05
+
+
+def test_alpha_is_where_the_policy_observes_it(plan):
+    environment = plan.players[plan.conditions[0][0].name].environment
+    low, high = (
+        jax.jit(environment.reset)(jax.random.key(0), jnp.float32(a)).obs
+        for a in (0.25, 0.75)
+    )
+    (entry,) = np.flatnonzero(low != high)
+    assert entry == ALPHA_ENTRY and low[entry] == 0.25 and high[entry] == 0.75
 
 
 def test_policy_is_told_an_alpha_it_knows(push):

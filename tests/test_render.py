@@ -15,7 +15,7 @@ from matplotlib.image import imread
 
 from dcc_jax import draw, quat
 from dcc_jax.config import make_config
-from dcc_jax.evaluate.episodes import Motion, displaced
+from dcc_jax.evaluate.recording import Motion, displaced
 from dcc_jax.render import film
 from dcc_jax.tasks import make_environment
 

@@ -182,7 +182,9 @@ def _draw_ground(axes: Axes, camera: Camera, around: Array) -> None:
     pixels, depth = camera.project(lines)
     pieces = np.stack([pixels[:, :-1], pixels[:, 1:]], 2).reshape(-1, 2, 2)
     visible = (np.minimum(depth[:, :-1], depth[:, 1:]) > 2 * NEAR).ravel()
-    axes.add_collection(LineCollection(pieces[visible], colors=GRID, lw=0.8, zorder=1))
+    axes.add_collection(
+        LineCollection(list(pieces[visible]), colors=GRID, lw=0.8, zorder=1)
+    )
 
 
 def _draw_geoms(
@@ -195,7 +197,7 @@ def _draw_geoms(
 ) -> None:
     """The silhouettes of shapes, the one that reaches farthest first."""
     items = []
-    for geom in np.flatnonzero(shown & (model.geom_group <= 2)):
+    for geom in np.flatnonzero(shown & (model.geom_group <= 2)).tolist():
         outline = _outline(camera, model, data, geom)
         if outline is not None:
             depth = camera.project(_corners(model, data, geom))[1].max()

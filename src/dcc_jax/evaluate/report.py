@@ -18,37 +18,13 @@ import numpy as np
 
 from dcc_jax.env.environment import CONTROL_RATE
 from dcc_jax.env.task import Task
-from dcc_jax.evaluate import bootstrap, measures
+from dcc_jax.evaluate import bootstrap, compare, measures
 from dcc_jax.evaluate.bootstrap import Interval
-from dcc_jax.evaluate.episodes import Player, Recording
+from dcc_jax.evaluate.compare import Comparison, Condition, Part
+from dcc_jax.evaluate.episodes import Player
+from dcc_jax.evaluate.recording import Recording
 from dcc_jax.evaluate.runs import Run, find_run, make_environment
 from dcc_jax.learn import style
-
-POOLED = {
-    "contact/peak_p95": ("N", "95 % quantile of the contacts' largest forces"),
-    "contact/peak_max": ("N", "the largest of all"),
-    "style/frechet": ("m", "Frechet distance of pose pairs to those of the clips"),
-    "broken": ("", "episodes in which the physics broke"),
-}
-"""Metrics of a condition that are none of one episode: unit and meaning."""
-
-
-@dataclass(frozen=True)
-class Condition:
-    """A policy at a level of compliance."""
-
-    run: str
-    alpha: float
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """A condition against its run's first, or the first of all if each run has one."""
-
-    condition: int  # index into Report.conditions
-    baseline: int
-    ratio: dict[str, Interval]  # by metric, of the means
-    difference: dict[str, Interval]
 
 
 @dataclass(frozen=True)
@@ -142,7 +118,8 @@ def execute(plan: Plan, progress: Callable[[int, int], None]) -> Report:
     """Plays and measures."""
     steps = round(plan.seconds * CONTROL_RATE) * plan.episodes
     total = steps * len(plan.conditions)
-    parts = []
+    parts: list[Part] = []
+    clips: dict[Player, style.Reference] = {}
     for i, (run, level) in enumerate(plan.conditions):
         player = plan.players[run.name]
         recording = player.play(
@@ -153,7 +130,10 @@ def execute(plan: Plan, progress: Callable[[int, int], None]) -> Report:
             seconds=plan.seconds,
             progress=lambda done, i=i: progress(i * steps + done, total),
         )
-        parts.append(_part(player, recording, Condition(run.name, level)))
+        if player not in clips:
+            clips[player] = _clips(player)
+        condition = Condition(run.name, level)
+        parts.append(_part(player, clips[player], recording, condition))
     return _report(parts, plan)
 
 
@@ -211,21 +191,14 @@ def _players(runs: list[Run], task: Task | None) -> dict[str, Player]:
     return players
 
 
-@dataclass(frozen=True)
-class _Part:
-    """One condition, measured."""
-
-    condition: Condition
-    rows: list[dict[str, float]]
-    contacts: list[list[dict[str, float]]]  # of each episode
-    pooled: dict[str, float]
-    curves: dict[str, list[list[float]]]
-    survival: list[float]
+def _clips(player: Player) -> style.Reference:
+    return jax.jit(lambda: style.make_reference(player.environment))()
 
 
-def _part(player: Player, recording: Recording, condition: Condition) -> _Part:
+def _part(
+    player: Player, clips: style.Reference, recording: Recording, condition: Condition
+) -> Part:
     clock = player.environment.task.clock
-    clips = jax.jit(lambda: style.make_reference(player.environment))()
     nearest = np.full(recording.pairs_alive.shape, np.nan)
     alive = recording.pairs_alive
     pairs = jnp.asarray(recording.pairs[alive])
@@ -234,7 +207,7 @@ def _part(player: Player, recording: Recording, condition: Condition) -> _Part:
         nearest[alive] = style.nearest(clips, pairs)
         frechet = float(style.frechet(clips, pairs, jnp.ones(len(pairs))))
     contacts = [measures.contacts_of(recording, n) for n in range(len(recording.fell))]
-    return _Part(
+    return Part(
         condition=condition,
         rows=measures.rows(recording, nearest, contacts, clock),
         contacts=contacts,
@@ -244,23 +217,16 @@ def _part(player: Player, recording: Recording, condition: Condition) -> _Part:
     )
 
 
-def _report(parts: list[_Part], plan: Plan) -> Report:
+def _report(parts: list[Part], plan: Plan) -> Report:
     task = plan.players[parts[0].condition.run].environment.task
     resamples = bootstrap.draws(plan.episodes)
-    several = any(p.condition.run == parts[0].condition.run for p in parts[1:])
-    comparisons = []
-    for i, part in enumerate(parts):
-        same = [j for j, p in enumerate(parts) if p.condition.run == part.condition.run]
-        baseline = same[0] if several else 0
-        if i != baseline:
-            comparisons.append(_compared(parts, i, baseline, resamples))
     return Report(
         task=task.name,
         seed=plan.seed,
         seconds=plan.seconds,
         conditions=[part.condition for part in parts],
-        summary=[_summary(part, resamples) for part in parts],
-        comparisons=comparisons,
+        summary=[compare.summary(part, resamples) for part in parts],
+        comparisons=compare.comparisons(parts, resamples),
         rows=[
             _named(part, n) | row for part in parts for n, row in enumerate(part.rows)
         ],
@@ -276,45 +242,8 @@ def _report(parts: list[_Part], plan: Plan) -> Report:
     )
 
 
-def _named(part: _Part, episode: int) -> dict[str, Any]:
+def _named(part: Part, episode: int) -> dict[str, Any]:
     return {**asdict(part.condition), "episode": episode}
-
-
-def _column(part: _Part, name: str) -> np.ndarray:
-    return np.array([row[name] for row in part.rows])
-
-
-def _summary(part: _Part, resamples: np.ndarray) -> dict[str, Interval]:
-    columns = {name: _column(part, name) for name in part.rows[0]}
-    summary = {
-        name: bootstrap.share(values)
-        if name == "fell"
-        else bootstrap.mean(values, resamples)
-        for name, values in columns.items()
-    }
-    peaks = [(c["peak"], n) for n, cs in enumerate(part.contacts) for c in cs]
-    values, episode = np.array(peaks).reshape(-1, 2).T
-    nothing = np.nan, np.nan
-    summary["contact/peak_p95"] = bootstrap.quantile(
-        values, episode.astype(int), 0.95, resamples
-    )
-    summary["contact/peak_max"] = Interval(values.max(initial=0.0), *nothing)
-    return summary | {k: Interval(v, *nothing) for k, v in part.pooled.items()}
-
-
-def _compared(
-    parts: list[_Part], i: int, baseline: int, resamples: np.ndarray
-) -> Comparison:
-    pairs = {
-        name: (_column(parts[i], name), _column(parts[baseline], name), resamples)
-        for name in parts[i].rows[0]
-    }
-    return Comparison(
-        condition=i,
-        baseline=baseline,
-        ratio={name: bootstrap.ratio(*pair) for name, pair in pairs.items()},
-        difference={name: bootstrap.difference(*pair) for name, pair in pairs.items()},
-    )
 
 
 def _defined(value: Any) -> Any:

@@ -11,8 +11,9 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from dcc_jax.evaluate.bootstrap import Interval
+from dcc_jax.evaluate.compare import POOLED, Comparison
 from dcc_jax.evaluate.measures import CURVES, DT, METRICS
-from dcc_jax.evaluate.report import POOLED, Comparison, Report
+from dcc_jax.evaluate.report import Report
 
 COLOURS = ("#1f6fb4", "#c8553d", "#3a7d44", "#8a5fb0", "#b8860b", "#555555")
 COMPARED = (

@@ -14,11 +14,13 @@ Letters: N pairs of the policy, M pairs of the clips, E coordinates of a pair.
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import flax.struct
 import jax
 import jax.numpy as jnp
 
-from dcc_jax.learn.rollout import Environment, Running
+from dcc_jax.learn.rollout import Running
 
 Array = jax.Array
 
@@ -26,6 +28,13 @@ CLIP_PAIRS = (
     2048  # M; other pairs of the same clips are then 4 to 5 mm from the nearest
 )
 _SEED = 20220707  # of the pairs, the same in every run, so that runs can be compared
+
+
+class Posed(Protocol):
+    """The part of an environment that is read here."""
+
+    def expert_pairs(self, key: Array, n: int) -> tuple[Array, Array, Array]: ...
+    def style_coordinates(self, s: Array, s_next: Array) -> Array: ...
 
 
 @flax.struct.dataclass
@@ -37,7 +46,7 @@ class Reference:
     root: Array  # [E, E] symmetric square root of the covariance
 
 
-def make_reference(environment: Environment, count: int = CLIP_PAIRS) -> Reference:
+def make_reference(environment: Posed, count: int = CLIP_PAIRS) -> Reference:
     """M pairs of an environment's clips and their Gaussian; equal for equal clips."""
     s, s_next, _ = environment.expert_pairs(jax.random.key(_SEED), count)
     pairs = environment.style_coordinates(s, s_next)
@@ -77,7 +86,7 @@ def frechet(reference: Reference, points: Array, weight: Array) -> Array:
     return jnp.sqrt(jnp.sum((mean - reference.mean) ** 2) + jnp.maximum(spread, 0.0))
 
 
-def of_running(environment: Environment, running: Running) -> dict[str, Array]:
+def of_running(environment: Posed, running: Running) -> dict[str, Array]:
     """`measure` of the pairs that the environments of a rollout hold now, [B].
 
     Those that were just reset hold none. It depends on the arguments alone, so that a

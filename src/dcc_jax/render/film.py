@@ -16,7 +16,8 @@ from matplotlib.image import imsave
 from dcc_jax import draw
 from dcc_jax.env.environment import CONTROL_RATE
 from dcc_jax.env.task import Task
-from dcc_jax.evaluate.episodes import Motion, Player, Recording, displaced
+from dcc_jax.evaluate.episodes import Player
+from dcc_jax.evaluate.recording import Motion, Recording, displaced
 from dcc_jax.evaluate.runs import Run, find_run, make_environment
 
 EPISODES = 8  # played at once; the next one begins where one ends by a fall
