@@ -29,15 +29,28 @@ def _actors(env: Toy) -> rollout.Actors:
 @pytest.fixture(scope="module")
 def taken() -> tuple[rollout.Actors, rollout.Rollout]:
     """Walls and a clock that end episodes both ways within 30 steps."""
+    return _taken(chunk=4)
+
+
+def _taken(chunk: int | None) -> tuple[rollout.Actors, rollout.Rollout]:
     env = Toy(wall=1.5, horizon=7)
     actors = _actors(env)
     keys = jax.random.split(jax.random.key(1), ENVS)
 
-    def run(key: jax.Array, chunk: int) -> rollout.Rollout:
+    def run(key: jax.Array) -> rollout.Rollout:
         running = rollout.reset_all(keys, env, None)
         return rollout.rollout(key, env, actors, running, STEPS, CONFIG, chunk)
 
-    return actors, jax.jit(run, static_argnums=1)(jax.random.key(2), 4)
+    return actors, jax.jit(run)(jax.random.key(2))
+
+
+def test_size_of_a_chunk_changes_no_number(taken):
+    whole = _taken(chunk=None)[1]
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, atol=2e-5),
+        (taken[1].transitions, taken[1].env_metrics, taken[1].running),
+        (whole.transitions, whole.env_metrics, whole.running),
+    )
 
 
 def test_chunks_come_back_in_time_and_environment_order(taken):

@@ -163,23 +163,25 @@ def rollout(
             the working set stays in a CPU's cache. None: all.
     """
     count = running.steps.shape[0]
+    draws = _draws(key, length, running, environment)
     if chunk is None or chunk >= count:
-        return _rollout(key, environment, actors, running, length, config)
+        return _rollout(draws, environment, actors, running, config)
     chunks = count // chunk
     split = jax.tree.map(lambda x: x.reshape(chunks, chunk, *x.shape[1:]), running)
+    # Drawn before the split: the size of a chunk changes no number.
+    shares = jax.tree.map(lambda x: _divided(x, chunks), draws)
     parts: Rollout = jax.lax.map(
-        lambda part: _rollout(part[0], environment, actors, part[1], length, config),
-        (jax.random.split(key, chunks), split),
+        lambda part: _rollout(part[0], environment, actors, part[1], config),
+        (shares, split),
     )
     return _joined(parts, count)
 
 
 def _rollout(
-    key: Array,
+    draws: tuple[Array, Array, Array],
     environment: Environment,
     actors: Actors,
     running: Running,
-    length: int,
     config: ppo.PpoConfig,
 ) -> Rollout:
     def step(
@@ -204,7 +206,7 @@ def _rollout(
         action=jnp.zeros(environment.action_size),
     )
     (running, incident), (transitions, means) = jax.lax.scan(
-        step, (running, nothing), _draws(key, length, running, environment)
+        step, (running, nothing), draws
     )
     return Rollout(
         running=running,
@@ -219,10 +221,10 @@ def _draws(
 ) -> tuple[Array, Array, Array]:
     """Action noise [T, B, A], step keys and reset keys [T, B], all drawn at once."""
     count = running.steps.shape[0]
-    noise_key, env_key = jax.random.split(key)
+    noise_key, step_key, reset_key = jax.random.split(key, 3)
     noise = jax.random.normal(noise_key, (length, count, environment.action_size))
-    keys = jax.random.split(env_key, (2, length, count))
-    return noise, keys[0], keys[1]
+    step_keys = jax.random.split(step_key, (length, count))
+    return noise, step_keys, jax.random.split(reset_key, (length, count))
 
 
 def _transition(
@@ -284,6 +286,15 @@ def _recorded(incident: Incident, nan: Array, env: Any, action: Array) -> Incide
         return Incident(happened=jnp.asarray(True), env=state, action=action[at])
 
     return jax.lax.cond(jnp.any(nan), record, lambda old: old, incident)
+
+
+def _divided(x: Array, chunks: int) -> Array:
+    """[T, B, ...] -> [chunks, T, b, ...], of numbers or keys."""
+    if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+        # The checker of keys takes a transposition for a use.
+        data = _divided(jax.random.key_data(x), chunks)
+        return jax.random.wrap_key_data(data, impl=jax.random.key_impl(x))
+    return jnp.moveaxis(x.reshape(x.shape[0], chunks, -1, *x.shape[2:]), 1, 0)
 
 
 def _joined(parts: Rollout, count: int) -> Rollout:
