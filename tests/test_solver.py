@@ -107,6 +107,26 @@ def test_optimum_satisfies_the_conditions_of_the_convex_problem(shape):
     np.testing.assert_allclose(alone[0], qacc[0], atol=2e-5)
 
 
+def test_iteration_stops_where_it_has_arrived_and_no_environment_notices_others(shape):
+    """More iterations allowed, or easier problems beside it: not a bit changes."""
+    p = [jnp.asarray(value, jnp.float32) for value in _problem(shape, 3).values()]
+
+    def solved(most: int, problem: list) -> tuple[jax.Array, jax.Array]:
+        def one(mass, smooth, J, D, aref, start):
+            rows = solver.Rows(J, D, aref, min(5, shape.num_rows))
+            return solver.newton(shape, mass, smooth, rows, start, most)
+
+        return jax.jit(jax.vmap(one))(*problem)
+
+    qacc, force = solved(20, p)
+    np.testing.assert_array_equal(force, solved(50, p)[1])
+    assert np.abs(solved(1, p)[1] - force).max() > 1e-3, "one step is not enough"
+    # The first starts at its solution now and waits for the others.
+    easier = [*p[:5], p[5].at[0].set(qacc[0])]
+    np.testing.assert_allclose(solved(20, easier)[1], force, atol=2e-5)
+    np.testing.assert_array_equal(solved(20, easier)[1][1:], force[1:])
+
+
 def test_limbs_that_touch_each_other_are_solved_together():
     """A row between two limbs makes one limb of them; the answer stays exact."""
     model = mujoco.MjModel.from_xml_string(

@@ -93,7 +93,7 @@ def make_scene(
     character: Character,
     *,
     root: str = "root",
-    newton_iterations: int = 3,
+    newton_iterations: int = 8,
 ) -> Scene:
     """A scene ready to step, its stable PD built in.
 

@@ -47,7 +47,7 @@ class EnvConfig:
     """Physics steps a second, a multiple of 30; the paper has 600 (Sec. 5.1). 240 is
     stable with the implicit PD (docs/performance.md)."""
 
-    newton_iterations: int = 3
+    newton_iterations: int = 8
     """Of the contact solver (docs/performance.md)."""
 
     alpha: float = 0.16
