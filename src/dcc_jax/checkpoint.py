@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
@@ -223,7 +224,7 @@ def _name(path: Any) -> str:
 
 
 def _is_key(leaf: Any) -> bool:
-    return jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def _raw(leaf: Any) -> Any:
@@ -232,7 +233,7 @@ def _raw(leaf: Any) -> Any:
 
 def _restored(name: str, array: np.ndarray, like: Any) -> Any:
     if _is_key(like):
-        return jax.random.wrap_key_data(array)
+        return jax.random.wrap_key_data(jnp.asarray(array))
     if array.shape != like.shape:
         raise ValueError(
             f"the checkpoint does not fit this run: {name} has shape "

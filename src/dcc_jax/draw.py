@@ -16,6 +16,7 @@ from ctypes.util import find_library
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -220,13 +221,12 @@ def write_mp4(path: str | Path, images: Iterator[np.ndarray], fps: float) -> Non
     import imageio.v2 as imageio
 
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    with (
-        warnings.catch_warnings(),
-        imageio.get_writer(
-            path, fps=fps, codec="libx264", quality=8, macro_block_size=2
-        ) as writer,
-    ):
+    with warnings.catch_warnings():
         # jax warns of any child process; ffmpeg shares nothing with it.
         warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called")
-        for image in images:
-            writer.append_data(image)
+        writer: Any = imageio.get_writer(
+            path, fps=fps, codec="libx264", quality=8, macro_block_size=2
+        )
+        with writer:
+            for image in images:
+                writer.append_data(image)

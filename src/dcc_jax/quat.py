@@ -101,7 +101,7 @@ def heading(q: Array) -> Array:
     The heading is the direction of q's x axis on the ground. Where that axis is
     vertical the heading is undefined and the identity is returned.
     """
-    w, x, y, z = jnp.moveaxis(q, -1, 0)
+    w, x, y, z = (q[..., i] for i in range(4))
     forward_x = 1.0 - 2.0 * (y * y + z * z)
     forward_y = 2.0 * (x * y + w * z)
     defined = forward_x**2 + forward_y**2 > 1e-10

@@ -42,12 +42,12 @@ def unclipped(
     joints, targets = q[7:].reshape(-1, 4), q_bar[7:].reshape(-1, 4)
     error = quat.log(quat.mul(quat.inv(joints), targets)).reshape(-1)
     error = jnp.concatenate([jnp.zeros(6, error.dtype), error])
-    kp = character.kp.astype(error.dtype)
-    kv = character.kv.astype(error.dtype)
+    kp = jnp.asarray(character.kp, error.dtype)
+    kv = jnp.asarray(character.kv, error.dtype)
     return kp * (error - h * qd) - kv * qd
 
 
 def clipped(character: Character, tau: Array) -> Array:
     """tau within the torque limits, [42]."""
-    limit = character.torque_limit.astype(tau.dtype)
+    limit = jnp.asarray(character.torque_limit, tau.dtype)
     return jnp.clip(tau, -limit, limit)

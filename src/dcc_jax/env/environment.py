@@ -10,6 +10,7 @@ episode ends. It knows no task and no discriminator; both come from outside.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -186,15 +187,13 @@ class Environment:
         self.limbs = np.array(
             [i for i, n in enumerate(names) if not n.endswith(("foot", "shin"))]
         )
+        self.action_size = 36 + task.extra_actions
+        self.observation_size = 270 + 36 + 4 + 1 + task.tracks + task.state_size
+        self.feature_size = 270
+        self.condition_size = 0
+        self.has_task_reward = task.has_reward
+        self.tracks = task.tracks
 
-    action_size = property(lambda self: 36 + self.task.extra_actions)
-    observation_size = property(
-        lambda self: 270 + 36 + 4 + 1 + self.task.tracks + self.task.state_size
-    )
-    feature_size = property(lambda self: 270)
-    condition_size = property(lambda self: 0)
-    has_task_reward = property(lambda self: self.task.has_reward)
-    tracks = property(lambda self: self.task.tracks)
     control_dt = 1.0 / CONTROL_RATE
 
     def reset(self, key: Array, alpha: Array | None = None) -> EnvState:
@@ -274,7 +273,8 @@ class Environment:
 
     def end(self, state: EnvState, plan: Plan, end: Substep) -> EnvState:
         """The state after a control step, by that before it and its last substep."""
-        new = state.replace(
+        new = dataclasses.replace(
+            state,
             body=end.body,
             displacement=end.displacement,
             task=end.task,
@@ -458,7 +458,8 @@ class Environment:
         )
         first = state.time == 0.0
         body_features = numbers[:270]
-        return state.replace(
+        return dataclasses.replace(
+            state,
             obs=obs,
             features=body_features,
             previous_features=jnp.where(first, body_features, state.previous_features),
@@ -495,7 +496,8 @@ class Environment:
             pos_w[self.limbs, 2] < ground + config.limb_clearance
         )
         failed = self.task.terminated(scene, state.task, state.body)
-        return state.replace(
+        return dataclasses.replace(
+            state,
             r_q=self._tracking(state, q),
             r_p=r_p,
             r_task=self.task.reward(scene, state.task, state.body),
@@ -546,8 +548,10 @@ def _at_origin(reference: RefState) -> RefState:
 def _moved(reference: RefState, away: Array) -> RefState:
     """The same moment, elsewhere by [2] m over the ground."""
     shift = jnp.zeros(55).at[:2].set(away)
-    return reference.replace(
-        qpos=reference.qpos + shift, qpos_previous=reference.qpos_previous + shift
+    return dataclasses.replace(
+        reference,
+        qpos=reference.qpos + shift,
+        qpos_previous=reference.qpos_previous + shift,
     )
 
 
@@ -562,7 +566,8 @@ def _contained(new: EnvState, old: EnvState) -> EnvState:
     leaves = [x for x in jax.tree.leaves(new) if jnp.issubdtype(x.dtype, jnp.inexact)]
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in leaves]))
     kept = jax.tree.map(lambda n, o: jnp.where(finite, n, o), new, old)
-    return kept.replace(
+    return dataclasses.replace(
+        kept,
         terminated=kept.terminated | ~finite,
         truncated=kept.truncated & finite,
         nan=~finite,

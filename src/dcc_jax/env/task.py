@@ -7,6 +7,7 @@ Letters: F forces the compliance reacts to, S numbers of the task's own state ve
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -100,7 +101,9 @@ class Task:
             start: at the reset, the mean velocity of a loop with it.
             time: s since the reset.
         """
-        return start.replace(position=start.position + time * start.velocity)
+        return dataclasses.replace(
+            start, position=start.position + time * start.velocity
+        )
 
     def applied(
         self, scene: physics.Scene, state: Any, kin: physics.Kinematics, time: Array

@@ -6,6 +6,7 @@ Letters: R runs of a sweep, D devices.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
@@ -127,7 +128,9 @@ def _state_specs(runs: bool) -> TrainState:
     shared = PartitionSpec()
     split = PartitionSpec(None, AXIS) if runs else PartitionSpec(AXIS)
     names = TrainState.__dataclass_fields__
-    return TrainState(**{n: split if n == "running" else shared for n in names})
+    # Any: a tree of specs has the state's structure, not its types.
+    specs: dict[str, Any] = {n: split if n == "running" else shared for n in names}
+    return TrainState(**specs)
 
 
 def _check_multiple(name: str, value: int, devices: int) -> None:

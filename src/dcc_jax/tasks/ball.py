@@ -8,6 +8,7 @@ the body, and move it, without leaving its reference.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import ClassVar
@@ -143,7 +144,7 @@ class Ball(Task):
         """Pushes the ball when its time has come."""
         due = state.next_push <= 0.0
         pushed = self._pushed(key, scene, body)
-        body = body.replace(qvel=jnp.where(due, pushed, body.qvel))
+        body = dataclasses.replace(body, qvel=jnp.where(due, pushed, body.qvel))
         waited = jnp.where(due, self.interval, state.next_push)
         return State(waited - 1.0 / 30.0), body
 

@@ -227,7 +227,7 @@ class ChickenFight(Task):
     ) -> tuple[Array, Array]:
         """The opponent's force [3] on a body, and its point [3]."""
         slots, sign = opponent_contacts(scene, body, self.opponent)
-        force = sign[:, None] * solution.contact_force_w[slots]
+        force = jnp.asarray(sign)[:, None] * solution.contact_force_w[slots]
         return resultant(force, solution.contact_point_w[slots])
 
     def observe(self, scene: physics.Scene, state: State, body: physics.State) -> Array:

@@ -11,6 +11,7 @@ and a hand that is up to 5 cm away is drawn in without its orientation being for
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import ClassVar
@@ -170,15 +171,15 @@ class Door(Task):
     ) -> tuple[State, physics.State]:
         """The clip goes on; the forces are noted anew."""
         zero = jnp.zeros(())
-        state = state.replace(
-            time=state.time + 1.0 / 30.0, orthogonal=zero, parallel=zero
+        state = dataclasses.replace(
+            state, time=state.time + 1.0 / 30.0, orthogonal=zero, parallel=zero
         )
         return state, body
 
     def world(self, scene: physics.Scene, state: State, time: Array) -> physics.World:
         """Hand and knob are joined while the hand holds."""
         world = physics.default_world(scene)
-        return world.replace(equality_active=state.holding[None])
+        return dataclasses.replace(world, equality_active=state.holding[None])
 
     def forces(
         self,
@@ -199,7 +200,8 @@ class Door(Task):
         share = 30.0 * scene.timestep
         near = jnp.sum(jnp.square(palm - knob)) < self.reach**2
         due = (state.time >= GRASP_TIME) & (state.time < RELEASE_TIME)
-        noted = state.replace(
+        noted = dataclasses.replace(
+            state,
             holding=due & (state.holding | near),
             orthogonal=state.orthogonal + share * _norm(orthogonal),
             parallel=state.parallel - share * along,

@@ -5,6 +5,7 @@ The force fed to the compliance is the strongest contact of a ball with the char
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -110,7 +111,8 @@ class Push(Task):
         q_adr, v_adr = _ball(scene)
         pose = jnp.concatenate([start, jnp.array([1.0, 0.0, 0.0, 0.0])])
         motion = jnp.concatenate([velocity, jnp.zeros(3)])
-        return body.replace(
+        return dataclasses.replace(
+            body,
             qpos=body.qpos.at[q_adr : q_adr + 7].set(pose),
             qvel=body.qvel.at[v_adr : v_adr + 6].set(motion),
             qacc=body.qacc.at[v_adr : v_adr + 6].set(0.0),

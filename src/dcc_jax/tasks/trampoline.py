@@ -159,7 +159,8 @@ class Trampoline(Task):
         force = jnp.stack([f for f, _ in sums])
         touching = jnp.any(force != 0.0)
         landing = touching & (state.airborne > self.flight_time)
-        state = state.replace(
+        state = dataclasses.replace(
+            state,
             airborne=jnp.where(touching, 0.0, state.airborne + scene.timestep),
             landed=jnp.where(landing, 0.0, state.landed + scene.timestep),
             flipping=state.flipping | (landing & (jnp.abs(state.turned) > FLIP)),
@@ -217,5 +218,5 @@ def _foot_force(
     bodies = scene.contact_bodies
     slots = np.flatnonzero((bodies == foot).any(axis=1))
     sign = np.where(bodies[slots, 1] == foot, 1.0, -1.0)
-    force = sign[:, None] * solution.contact_force_w[slots]
+    force = jnp.asarray(sign)[:, None] * solution.contact_force_w[slots]
     return resultant(force, solution.contact_point_w[slots])
