@@ -321,6 +321,8 @@ def mass_solve(scene: Scene, kin: Kinematics, qfrc: Array) -> Array:
     With qfrc = J^T f this is FD(q, qd, f) - FD(q, qd, 0) of Alg. 1, because forward
     dynamics is linear in the external force.
     """
-    mass = mjx.full_m(scene.mjx_model, kin.data) - jnp.diag(scene.spd_diagonal)
-    solved = solve_mass(scene.mass_arrow, mass, jnp.atleast_2d(qfrc))
+    mass = mjx.full_m(scene.mjx_model, kin.data)
+    solved = solve_mass(
+        scene.mass_arrow, mass, scene.spd_diagonal, jnp.atleast_2d(qfrc)
+    )
     return solved.reshape(qfrc.shape)

@@ -67,9 +67,13 @@ def newton(
     return solve(mass, smooth, rows.J, rows.D, rows.aref, start)
 
 
-def solve_mass(shape: Arrow, mass: Array, forces: Array) -> Array:
-    """M^-1 f for M [nv, nv] and every f of forces [F, nv]: [F, nv]."""
-    return _batch_last(functools.partial(_solve_mass, shape))(mass, forces.T).T
+def solve_mass(shape: Arrow, mass: Array, less: np.ndarray, forces: Array) -> Array:
+    """(M - diag(less))^-1 f for M [nv, nv] and every f of forces [F, nv]: [F, nv].
+
+    The difference is taken of its parts, which `newton` has of M as well.
+    """
+    solve = _batch_last(functools.partial(_solve_mass, shape, less))
+    return solve(mass, forces.T).T
 
 
 def _batch_last(function: Callable) -> Callable:
@@ -181,8 +185,22 @@ def _newton(
     return _joined(shape, qacc), force[back]
 
 
-def _solve_mass(shape: Arrow, mass: Array, forces: Array) -> Array:
-    return _joined(shape, _solve(shape, _fronts(shape, mass), _split(shape, forces)))
+def _solve_mass(shape: Arrow, less: np.ndarray, mass: Array, forces: Array) -> Array:
+    fronts = _fronts(shape, mass)
+    less = np.append(less, 0.0)
+
+    def without(front: Array, dofs: np.ndarray) -> Array:
+        size = front.shape[-2] - dofs.shape[-1]
+        diagonal = np.pad(less[dofs], [(0, 0)] * (dofs.ndim - 1) + [(0, size)])
+        own = np.eye(front.shape[-2]) * diagonal[..., None]
+        return front - jnp.asarray(own, front.dtype)[..., None]
+
+    limbs = (
+        without(front, stack.dofs)
+        for stack, front in zip(shape.stacks, fronts.limbs, strict=True)
+    )
+    true = Fronts(tuple(limbs), without(fronts.core, shape.core))
+    return _joined(shape, _solve(shape, true, _split(shape, forces)))
 
 
 def _line_search(
@@ -222,8 +240,20 @@ def _row_order(shape: Arrow) -> np.ndarray:
 
 
 def _take(x: Array, index: np.ndarray) -> Array:
-    """x[index] along the first axis, zero where the index is one past the end."""
-    return jnp.concatenate([x, jnp.zeros_like(x[:1])])[index]
+    """x[index] along the first axis, zero where the index is one past the end.
+
+    Slices, one for each run of neighbours: a gather costs five times as much.
+    """
+    flat = index.ravel()
+    parts = []
+    for run in np.split(flat, np.flatnonzero(np.diff(flat) != 1) + 1):
+        if run.size:
+            parts.append(x[run[0] : run[-1] + 1])
+        if run.size and run[-1] == x.shape[0]:
+            parts.append(jnp.zeros((1, *x.shape[1:]), x.dtype))
+    if not parts:
+        return jnp.zeros((*index.shape, *x.shape[1:]), x.dtype)
+    return jnp.concatenate(parts).reshape(*index.shape, *x.shape[1:])
 
 
 def _split(shape: Arrow, x: Array) -> Split:
@@ -242,25 +272,45 @@ def _joined(shape: Arrow, x: Split) -> Array:
 
 
 def _fronts(shape: Arrow, mass: Array) -> Fronts:
-    flat = mass.reshape(-1, mass.shape[-1])
+    """M [nv, nv, B] in its parts; a limb's front leaves what is the core's to it."""
+    core = np.append(shape.core, shape.nv)
 
-    def front(position: np.ndarray, identity: np.ndarray) -> Array:
-        return _take(flat, position) + jnp.asarray(identity, flat.dtype)[..., None]
+    def front(dofs: np.ndarray, coupled: np.ndarray) -> Array:
+        own = _take(mass, dofs)
+        inner = _take(own.swapaxes(0, 1), dofs).swapaxes(0, 1)
+        outer = _take(own.swapaxes(0, 1), core[coupled])
+        top = jnp.concatenate([inner, outer.swapaxes(0, 1)], axis=1)
+        bottom = jnp.pad(outer, ((0, 0), (0, len(coupled)), (0, 0)))
+        return jnp.concatenate([top, bottom])
 
-    limbs = tuple(front(s.mass, s.identity) for s in shape.stacks)
-    return Fronts(limbs, front(shape.core_mass, shape.core_identity))
+    limbs = []
+    for stack in shape.stacks:
+        parts = [front(d, c) for d, c in zip(stack.dofs, stack.core, strict=True)]
+        limbs.append(_with_identity(jnp.stack(parts), stack.identity))
+    own = _take(_take(mass, shape.core).swapaxes(0, 1), shape.core).swapaxes(0, 1)
+    return Fronts(tuple(limbs), _with_identity(own, shape.core_identity))
+
+
+def _with_identity(front: Array, identity: np.ndarray) -> Array:
+    """Ones where a padded unknown is its own."""
+    if not identity.any():
+        return front
+    return front + jnp.asarray(identity, front.dtype)[..., None]
 
 
 def _row_parts(shape: Arrow, J: Array) -> Split:
     """The rows' non-zero columns: a stack's [G, r, n + k, B], the core's [r, c, B]."""
-    padded = jnp.pad(J, ((0, 1), (0, 1), (0, 0)))
     core = np.append(shape.core, shape.nv)
+    columns = J.swapaxes(0, 1)
+
+    def block(rows: np.ndarray, dofs: np.ndarray) -> Array:
+        return _take(_take(columns, dofs).swapaxes(0, 1), rows)
 
     def part(stack: Stack) -> Array:
-        columns = np.concatenate([stack.dofs, core[stack.core]], axis=1)
-        return padded[stack.rows[:, :, None], columns[:, None, :]]
+        seen = np.concatenate([stack.dofs, core[stack.core]], axis=1)
+        return jnp.stack([block(r, s) for r, s in zip(stack.rows, seen, strict=True)])
 
-    own = padded[shape.core_rows[:, None], shape.core]
+    own = block(shape.core_rows, shape.core)
     return Split(tuple(part(stack) for stack in shape.stacks), own)
 
 
