@@ -13,7 +13,6 @@ from types import TracebackType
 from rich.console import Console
 from rich.live import Live
 from rich.text import Text
-from tensorboardX import SummaryWriter
 
 WALL_CLOCK = ("seconds", "tuples_per_second")
 """Fields of `metrics.jsonl` that tell of the machine, not of the run.
@@ -37,6 +36,9 @@ class RunLog:
         self._path = run_dir / "metrics.jsonl"
         _truncate(self._path, update)
         self._file = self._path.open("a")
+        # Here because it changes the environment of the process that imports it.
+        from tensorboardX import SummaryWriter
+
         self._board = SummaryWriter(
             str(run_dir / "tensorboard"), purge_step=update + 1, flush_secs=30
         )
