@@ -1,0 +1,52 @@
+"""Every task through the three commands: train for a moment, evaluate, render."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from dcc_jax.tasks import TASKS
+
+# The package shows the functions of those names; these tests want the modules.
+evaluate = importlib.import_module("dcc_jax.evaluate.__main__")
+render = importlib.import_module("dcc_jax.render.__main__")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", TASKS)
+def test_task_trains_is_evaluated_and_drawn(
+    task: str, smoke_run: Callable[[str], Path], tmp_path: Path
+) -> None:
+    run_dir = smoke_run(task)
+    rows = [json.loads(line) for line in (run_dir / "metrics.jsonl").open()]
+    assert len(rows) == 2
+    for row in rows:
+        assert row["nan_count"] == 0
+        assert 0.0 < row["reward/total"] <= 1.0
+    table = tmp_path / "rows.json"
+    arguments = [
+        str(run_dir),
+        "--episodes",
+        "4",
+        "--seconds",
+        "1",
+        "--alpha",
+        "0",
+        "0.16",
+    ]
+    assert evaluate.main([*arguments, "--json", str(table)]) == 0
+    report = json.loads(table.read_text())
+    assert len(report["rows"]) == 8
+    assert all(row["broken"] == 0 for row in report["rows"] if "broken" in row)
+    picture = tmp_path / "strip.png"
+    strip = ["--strip", str(picture), "--seconds", "1", "--seed", "3"]
+    assert render.main([str(run_dir), *strip]) == 0
+    page = imread(picture)[..., :3]
+    frames = page.reshape(3, page.shape[0] // 3, 4, -1, 3).swapaxes(1, 2)
+    assert np.abs(frames[0, 0] - frames[1, 0]).mean() > 1e-3, "nothing moves"
