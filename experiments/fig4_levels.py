@@ -19,7 +19,6 @@ from pathlib import Path
 
 import paired
 
-import dcc_jax
 from dcc_jax import runtime
 
 LEVELS = (0.0, 0.04, 0.08, 0.12, 0.16, 0.2, 0.24, 0.28)
@@ -82,22 +81,11 @@ def draw(points: list[dict], out: Path) -> None:
 def main() -> None:
     options = paired.parser(__doc__, "fig4_levels", LEVELS)
     runtime.setup()
-    runs = paired.policies(options, "push", Path("runs/fig4_levels"))
-    report = dcc_jax.evaluate(
-        runs,
-        episodes=options.episodes,
-        alpha=options.alpha,
-        seed=options.seed,
-        say=print,
-    )
+    report = paired.evaluated(options, "push", Path("runs/fig4_levels"))
     points = measured(report.rows, options.alpha)
     paired.write(options.out, report.rows, points)
     draw(points, options.out)
-    for p in points:
-        if p["run"] is None:
-            interval = f"{p['value']:.3f} [{p['low']:.3f}, {p['high']:.3f}]"
-            print(f"alpha {p['alpha']:.2f}  {p['name']:15s} {interval}")
-    print(options.out)
+    paired.tell([p for p in points if p["run"] is None], options.out)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import paired
 
-import dcc_jax
 from dcc_jax import runtime
 
 if TYPE_CHECKING:
@@ -105,22 +104,11 @@ def draw(points: list[dict], out: Path) -> None:
 def main() -> None:
     options = paired.parser(__doc__, "fig5_trampoline", LEVELS)
     runtime.setup()
-    runs = paired.policies(options, "trampoline", Path("runs/fig5_trampoline"))
-    report = dcc_jax.evaluate(
-        runs,
-        episodes=options.episodes,
-        alpha=options.alpha,
-        seed=options.seed,
-        say=print,
-    )
+    report = paired.evaluated(options, "trampoline", Path("runs/fig5_trampoline"))
     points = measured(report, options.alpha)
     paired.write(options.out, report.rows, points)
     draw(points, options.out)
-    for p in points:
-        if p["name"] in BARS:
-            interval = f"{p['value']:.3f} [{p['low']:.3f}, {p['high']:.3f}]"
-            print(f"alpha {p['alpha']:.2f}  {p['name']:17s} {interval}")
-    print(options.out)
+    paired.tell([p for p in points if p["name"] in BARS], options.out)
 
 
 if __name__ == "__main__":

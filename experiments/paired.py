@@ -9,12 +9,16 @@ import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 import dcc_jax
 from dcc_jax.evaluate import bootstrap
 from dcc_jax.evaluate.bootstrap import Interval
+
+if TYPE_CHECKING:
+    from dcc_jax.evaluate.report import Report
 
 
 def parser(description: str, name: str, alpha: Sequence[float]) -> argparse.Namespace:
@@ -44,6 +48,25 @@ def policies(options: argparse.Namespace, task: str, folder: Path) -> list[Path]
     config = dataclasses.replace(config, env=env)
     begun = (folder / "config.json").exists()
     return [dcc_jax.train(config, run_dir=folder, resume=begun).run_dir]
+
+
+def evaluated(options: argparse.Namespace, task: str, folder: Path) -> Report:
+    """The episodes of those policies at every level of compliance."""
+    return dcc_jax.evaluate(
+        policies(options, task, folder),
+        episodes=options.episodes,
+        alpha=options.alpha,
+        seed=options.seed,
+        say=print,
+    )
+
+
+def tell(points: list[dict], out: Path) -> None:
+    """Prints the points, a line each, and where the figure is."""
+    for p in points:
+        interval = f"{p['value']:.3f} [{p['low']:.3f}, {p['high']:.3f}]"
+        print(f"alpha {p['alpha']:.2f}  {p['name']:17s} {interval}")
+    print(out)
 
 
 def column(rows: list[dict], name: str, **where: object) -> np.ndarray:

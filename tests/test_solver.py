@@ -48,11 +48,14 @@ def _problem(shape, seed: int) -> dict[str, np.ndarray]:
 
 def _room(shape) -> np.ndarray:
     """[nv, nv] where M may be non-zero."""
-    room = np.zeros(shape.nv**2 + 1, bool)
+    room = np.zeros((shape.nv + 1, shape.nv + 1), bool)
+    core = np.append(shape.core, shape.nv)
     for stack in shape.stacks:
-        room[stack.mass] = True
-    room[shape.core_mass] = True
-    return room[:-1].reshape(shape.nv, shape.nv)
+        for dofs, coupled in zip(stack.dofs, core[stack.core], strict=True):
+            room[np.ix_(dofs, np.append(dofs, coupled))] = True
+    room |= room.T
+    room[np.ix_(core, core)] = True
+    return room[:-1, :-1]
 
 
 def _row_room(shape) -> np.ndarray:

@@ -8,7 +8,12 @@ import os
 import sys
 import tempfile
 import traceback
-from typing import NoReturn
+from collections.abc import Callable, Sequence
+from typing import NoReturn, TypeVar
+
+from dcc_jax import runtime
+
+T = TypeVar("T")
 
 
 class Parser(argparse.ArgumentParser):
@@ -16,6 +21,37 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         raise ValueError(f"{message}; see --help")
+
+
+def run(
+    parser: Parser,
+    argv: Sequence[str] | None,
+    prepare: Callable[[argparse.Namespace], T],
+    execute: Callable[[T, argparse.Namespace], None],
+) -> int:
+    """Carries out a command; returns its exit status.
+
+    Args:
+        parser: of its arguments; its `prog` is what complaints begin with.
+        argv: the arguments; None: the process's own.
+        prepare: everything that may find bad input, which is status 2.
+        execute: the work, with what `prepare` returned; what goes wrong is status 1.
+    """
+    program = parser.prog.removeprefix("python -m ")
+    try:
+        options = parser.parse_args(argv)
+        if "jax" not in sys.modules:
+            runtime.setup()
+        prepared = prepare(options)
+    except (ValueError, OSError, ModuleNotFoundError) as error:
+        return complain(program, str(error), 2)
+    try:
+        execute(prepared, options)
+    except KeyboardInterrupt:
+        return complain(program, "interrupted", 1)
+    except Exception as error:
+        return fail(program, error)
+    return 0
 
 
 def complain(program: str, problem: str, status: int) -> int:

@@ -101,7 +101,7 @@ def make_scene(
         model: from `character.compose_scene`; it is copied, not changed.
         character: whose gains the implicit part of the PD uses.
         root: name of the character's free joint in the model.
-        newton_iterations: of the contact solver (docs/performance.md).
+        newton_iterations: of the contact solver, at most (docs/performance.md).
 
     Raises:
         ValueError: no joint `root`, or `newton_iterations` < 1.

@@ -30,13 +30,12 @@ BLOCK = 3
 class Stack:
     """G limbs of one size n, each coupled with k of the core's unknowns.
 
-    Indices that stand for padding are one past the end: nv, c, R or nv^2.
+    Indices that stand for padding are one past the end: nv, c or R.
     """
 
     dofs: np.ndarray  # [G, n] of the scene
     core: np.ndarray  # [G, k] positions in `Arrow.core`
     rows: np.ndarray  # [G, r] constraint rows that touch the limb
-    mass: np.ndarray  # [G, n + k, n + k] positions in M, row by row; its end: zero
     identity: np.ndarray  # [G, n + k, n + k] ones where a padded unknown is its own
 
 
@@ -49,7 +48,6 @@ class Arrow:
     stacks: tuple[Stack, ...]
     core: np.ndarray  # [c] dofs
     core_rows: np.ndarray  # [r] rows that touch no limb
-    core_mass: np.ndarray  # [c, c] positions in M
     core_identity: np.ndarray  # [c, c]
 
 
@@ -65,23 +63,18 @@ def arrow(model: mujoco.MjModel, row_pattern: np.ndarray) -> Arrow:
     is_core = _is_core(related, coupled)
     limbs = _components(coupled, np.flatnonzero(~is_core))
     core = np.flatnonzero(is_core)
-    nowhere = model.nv**2
-    position = np.full((model.nv + 1, model.nv + 1), nowhere)
-    entries = np.arange(nowhere).reshape(model.nv, model.nv)
-    position[:-1, :-1] = np.where(related, entries, nowhere)
     padded_core = _padded(core, model.nv, _rounded(len(core)))
     in_limb = row_pattern[:, ~is_core].any(axis=1)
     stacks = []
     for size in sorted({_rounded(len(limb)) for limb in limbs}, reverse=True):
         members = [limb for limb in limbs if _rounded(len(limb)) == size]
-        stacks.append(_stack(members, size, core, coupled, row_pattern, position))
+        stacks.append(_stack(members, size, core, coupled, row_pattern))
     return Arrow(
         nv=model.nv,
         num_rows=len(row_pattern),
         stacks=tuple(stacks),
         core=padded_core,
         core_rows=np.flatnonzero(~in_limb),
-        core_mass=position[np.ix_(padded_core, padded_core)],
         core_identity=np.diag((padded_core == model.nv).astype(float)),
     )
 
@@ -92,7 +85,6 @@ def _stack(
     core: np.ndarray,
     coupled: np.ndarray,
     row_pattern: np.ndarray,
-    position: np.ndarray,
 ) -> Stack:
     nv = len(coupled)
     touched = [
@@ -102,18 +94,13 @@ def _stack(
     width = max(map(len, touched))
     depth = max(map(len, rows))
     dofs = np.array([_padded(limb, nv, size) for limb in limbs])
-    padded_core = np.append(core, nv)
     columns = np.array([_padded(t, len(core), width) for t in touched])
-    everything = np.concatenate([dofs, padded_core[columns]], axis=1)
-    mass = position[everything[:, :, None], everything[:, None, :]]
-    mass[:, size:, size:] = nv**2  # the core keeps its own
-    identity = np.zeros(mass.shape)
+    identity = np.zeros((len(limbs), size + width, size + width))
     identity[:, range(size), range(size)] = dofs == nv
     return Stack(
         dofs=dofs,
         core=columns,
         rows=np.array([_padded(r, len(row_pattern), depth) for r in rows]),
-        mass=mass,
         identity=identity,
     )
 

@@ -30,8 +30,7 @@ def scene() -> physics.Scene:
     character = load_character(MASS)
     model = compose_scene(character, floor=False, extend=TASK.extend)
     model.opt.gravity[:] = 0.0
-    # Converged: after the default 3 iterations the readout is off by up to 2 %.
-    return physics.make_scene(model, character, newton_iterations=8)
+    return physics.make_scene(model, character)
 
 
 @pytest.fixture(scope="module")

@@ -29,8 +29,7 @@ def clip() -> Clip:
 
 @pytest.fixture(scope="module")
 def environment(character: Character, clip: Clip) -> Environment:
-    config = EnvConfig(newton_iterations=8)  # so that forces equal converged ones
-    return Environment(TASK, character, make_references([clip]), config)
+    return Environment(TASK, character, make_references([clip]), EnvConfig())
 
 
 def _start(environment: Environment, seconds: float) -> tuple:

@@ -29,7 +29,7 @@ WEIGHT = np.array([20.0, -30.0, -98.1])  # N, a load that pulls sideways as well
 def scene() -> physics.Scene:
     character = load_character()
     model = compose_scene(character, extend=TASK.extend)
-    return physics.make_scene(model, character, newton_iterations=6)
+    return physics.make_scene(model, character)
 
 
 @pytest.fixture(scope="module")

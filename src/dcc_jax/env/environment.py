@@ -49,7 +49,7 @@ class EnvConfig:
     stable with the implicit PD (docs/performance.md)."""
 
     newton_iterations: int = 8
-    """Of the contact solver (docs/performance.md)."""
+    """Of the contact solver, at most (docs/performance.md)."""
 
     alpha: float = 0.16
     """Level of compliance, in [0, 1] (Sec. 5.2 mostly uses 0.16)."""

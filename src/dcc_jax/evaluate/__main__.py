@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dcc_jax import command, runtime
+from dcc_jax import command
 
 if TYPE_CHECKING:
     from dcc_jax.evaluate.report import Plan
@@ -21,20 +21,7 @@ Every level of compliance meets the same initial states and perturbations. Exit 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
-    try:
-        options = _parser().parse_args(argv)
-        if "jax" not in sys.modules:
-            runtime.setup()
-        plan = _plan(options)
-    except (ValueError, OSError) as error:
-        return command.complain(PROGRAM, str(error), 2)
-    try:
-        _run(plan, options)
-    except KeyboardInterrupt:
-        return command.complain(PROGRAM, "interrupted", 1)
-    except Exception as error:
-        return command.fail(PROGRAM, error)
-    return 0
+    return command.run(_parser(), argv, _plan, _run)
 
 
 def _parser() -> command.Parser:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dcc_jax import command, runtime
+from dcc_jax import command
 
 if TYPE_CHECKING:
     from dcc_jax.render.film import Plan
@@ -21,20 +20,7 @@ argument; 1 a failure."""
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
-    try:
-        options = _parser().parse_args(argv)
-        if "jax" not in sys.modules:
-            runtime.setup()
-        plan = _plan(options)
-    except (ValueError, OSError, ModuleNotFoundError) as error:
-        return command.complain(PROGRAM, str(error), 2)
-    try:
-        _run(plan)
-    except KeyboardInterrupt:
-        return command.complain(PROGRAM, "interrupted", 1)
-    except Exception as error:
-        return command.fail(PROGRAM, error)
-    return 0
+    return command.run(_parser(), argv, _plan, _run)
 
 
 def _parser() -> command.Parser:
@@ -64,7 +50,7 @@ def _plan(options: argparse.Namespace) -> Plan:
     return film.prepare(**vars(options), task=None)
 
 
-def _run(plan: Plan) -> None:
+def _run(plan: Plan, _: argparse.Namespace) -> None:
     from rich.console import Console
     from rich.progress import track
 
