@@ -73,6 +73,10 @@ class Toy:
         s = 0.2 * jax.random.normal(key, (n, 2))
         return s, 0.7 * s, jnp.zeros((n, 0))
 
+    def demonstration(self, key: Array) -> tuple[Array, Array]:
+        state = self.reset(key)
+        return state.obs, -0.5 * state.features
+
     def style_coordinates(self, s: Array, s_next: Array) -> Array:
         return jnp.concatenate([s, s_next], axis=-1)
 
@@ -123,5 +127,7 @@ class ToyConfig:
         )
     )
     train: TrainConfig = field(
-        default_factory=lambda: TrainConfig(num_envs=32, unroll_length=16)
+        default_factory=lambda: TrainConfig(
+            num_envs=32, unroll_length=16, warm_start_steps=0
+        )
     )

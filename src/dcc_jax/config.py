@@ -75,13 +75,24 @@ def _smoke(config: Config) -> Config:
             num_envs=16,
             unroll_length=8,
             total_tuples=4 * 16 * 8,
+            warm_start_steps=20,
             checkpoint_interval=2,
         ),
     )
 
 
 def _cpu(config: Config) -> Config:
-    return config
+    """Many small updates: few environments, and tuples are dear."""
+    return dataclasses.replace(
+        config,
+        ppo=dataclasses.replace(
+            config.ppo, discount=0.98, target_kl=0.04, minibatch_size=1024
+        ),
+        disc=dataclasses.replace(config.disc, learning_rate=2e-5, minibatches=8),
+        train=dataclasses.replace(
+            config.train, unroll_length=16, checkpoint_interval=100
+        ),
+    )
 
 
 def _gpu(config: Config) -> Config:
@@ -102,7 +113,6 @@ def _paper(config: Config) -> Config:
         env=dataclasses.replace(config.env, physics_rate=600),
         ppo=dataclasses.replace(
             config.ppo,
-            learning_rate=1e-5,
             value_learning_rate=1e-5,
             target_kl=None,
             minibatch_size=128,
@@ -113,6 +123,7 @@ def _paper(config: Config) -> Config:
             config.train,
             num_envs=16,
             unroll_length=128,
+            warm_start_steps=0,
             total_tuples=80_000_000,
             checkpoint_interval=200,
         ),

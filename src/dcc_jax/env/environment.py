@@ -187,6 +187,9 @@ class Environment:
         self.limbs = np.array(
             [i for i, n in enumerate(names) if not n.endswith(("foot", "shin"))]
         )
+        joints = character.kp > 0.0
+        lag = float(np.mean(character.kv[joints] / character.kp[joints]))
+        self.demonstration_lead = 0.5 * self.control_dt + lag
         self.action_size = 36 + task.extra_actions
         self.observation_size = 270 + 36 + 4 + 1 + task.tracks + task.state_size
         self.feature_size = 270
@@ -301,6 +304,21 @@ class Environment:
             pair(windows[:, 2], windows[:, 1]),
             jnp.zeros((n, 0)),
         )
+
+    def demonstration(self, key: Array) -> tuple[Array, Array]:
+        """A moment of the clips and what leads on from there: obs [O], action [A].
+
+        The action asks for the clip's pose half a control step and kv / kp later: a PD
+        with its target at rest lags by that much behind a steady motion.
+        """
+        state = self.reset(key)
+        at = state.reference
+        ahead = self.references.qpos_at(at.clip, at.time + self.demonstration_lead)
+        base = self._following(at).qpos if self.task.tracks else self.nominal
+        _, wanted = self.kinematics.coords.split_q(ahead)
+        _, offered = self.kinematics.coords.split_q(base)
+        turn = quat.log(quat.mul(quat.inv(offered), wanted))[1:]
+        return state.obs, jnp.pad(turn.reshape(-1), (0, self.task.extra_actions))
 
     def style_coordinates(self, s: Array, s_next: Array) -> Array:
         """Pairs of features [..., 270] as points [..., 225] in m (`learn.style`)."""

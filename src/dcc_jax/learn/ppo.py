@@ -36,9 +36,9 @@ class PpoConfig:
     clip: float = 0.2
     """The probability ratio counts within 1 +- clip (Schulman 2017)."""
 
-    learning_rate: float = 1e-4
-    """Step size of the policy, the first one if `target_kl` is set; the paper has
-    1e-5 (Sec. 5.1)."""
+    learning_rate: float = 1e-5
+    """Step size of the policy (Sec. 5.1), the first one if `target_kl` is set: with a
+    larger one Adam's first steps would undo the warm start."""
 
     value_learning_rate: float = 3e-4
     """Step size of the value function; the paper has 1e-5 for both."""

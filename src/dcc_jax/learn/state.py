@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from dcc_jax.env.rewards import RewardConfig
-from dcc_jax.learn import networks, normalizer, ppo
+from dcc_jax.learn import networks, normalizer, ppo, warm_start
 from dcc_jax.learn.discriminator import DiscriminatorConfig
 from dcc_jax.learn.ppo import PpoConfig
 from dcc_jax.learn.rollout import Environment, Incident, Running, reset_all
@@ -41,6 +41,10 @@ class TrainConfig:
     total_tuples: int = 20_000_000
     """Training ends after as many (s, a, r, s'); the paper has 20-80 M (Sec. 5.1)."""
 
+    warm_start_steps: int = 500
+    """Supervised steps in which the policy learns to lead along the clips before its
+    first update; 0: it begins with random weights, as in the paper."""
+
     checkpoint_interval: int = 50
     """Updates between checkpoints; one is also written at the end and on a signal."""
 
@@ -58,6 +62,10 @@ class TrainConfig:
             value = getattr(self, name)
             if value < 1:
                 raise ValueError(f"train.{name} must be 1 or more, got {value}")
+        if self.warm_start_steps < 0:
+            raise ValueError(
+                f"train.warm_start_steps must be 0 or more, got {self.warm_start_steps}"
+            )
         if self.chunk_size is not None and self.chunk_size < 1:
             raise ValueError(
                 f"train.chunk_size must be 1 or more, or None, got {self.chunk_size}"
@@ -130,19 +138,35 @@ def init_state(
         config: sizes.
         local_envs: B.
     """
-    key, agent_key, disc_key, reset_key, expert_key = jax.random.split(key, 5)
+    key, agent_key, disc_key, reset_key, expert_key, warm_key = jax.random.split(key, 6)
     reset_keys = jax.random.split(of_device(reset_key), local_envs)
     running = reset_all(reset_keys, environment, alpha)
+    obs_normalizer = normalizer.init_normalizer(running.env.obs, AXIS)
+    agent = ppo.init_agent(
+        agent_key, environment.observation_size, environment.action_size, config.ppo
+    )
+    if config.train.warm_start_steps:
+        lesson_key, moments_key = jax.random.split(of_device(warm_key))
+        keys = jax.random.split(moments_key, config.train.unroll_length * local_envs)
+        obs, _ = jax.vmap(environment.demonstration)(keys)
+        obs_normalizer = normalizer.init_normalizer(obs, AXIS)
+        agent = warm_start.warm_start(
+            lesson_key,
+            agent,
+            obs_normalizer,
+            environment,
+            config.ppo,
+            config.train.warm_start_steps,
+            AXIS,
+        )
     s, _, _ = environment.expert_pairs(expert_key, _EXPERT_SAMPLE)
     width = 2 * environment.feature_size + environment.condition_size
     disc = networks.init_mlp(disc_key, (width, *config.disc.hidden, 1))
     optimizer = networks.clipped_adam(config.disc.max_gradient_norm)
     return TrainState(
-        agent=ppo.init_agent(
-            agent_key, environment.observation_size, environment.action_size, config.ppo
-        ),
+        agent=agent,
         disc=networks.init_network(disc, optimizer),
-        obs_normalizer=normalizer.init_normalizer(running.env.obs, AXIS),
+        obs_normalizer=obs_normalizer,
         feature_normalizer=normalizer.init_normalizer(s),
         running=running,
         alpha=alpha,
