@@ -3,8 +3,8 @@
     python benchmarks/training.py [--task push] [--preset cpu] [--json FILE]
                                   [--rounds 5] [--skip-first-update] [--skip-brax]
 
-The parts are found by leaving them out: an update with half the PPO epochs, one with
-half the discriminator's minibatches, a rollout of the physics alone (kinematics, PD,
+The parts are found by what more of them costs: an update with twice the PPO epochs, one
+with twice the discriminator's minibatches, a rollout of the physics alone (kinematics, PD,
 contacts, compliance) and one with the environment around it. All take turns in one
 run, and shares are of medians. Brax's PPO, from `pip install dcc-jax[benchmark]`,
 trains the same character in `mjx.step` at the same rate, batch and widths.
@@ -155,9 +155,9 @@ def split(config: Config, rounds: int) -> dict[str, float]:
     seconds = medians(
         {
             "update": update_of(environment, config),
-            "half_ppo": update_of(environment, with_epochs(config, epochs // 2)),
-            "half_disc": update_of(
-                environment, with_minibatches(config, minibatches // 2)
+            "twice_ppo": update_of(environment, with_epochs(config, 2 * epochs)),
+            "twice_disc": update_of(
+                environment, with_minibatches(config, 2 * minibatches)
             ),
             "physics": rollout_of(environment, config, physics_alone),
             "environment": rollout_of(environment, config, whole_step),
@@ -165,9 +165,8 @@ def split(config: Config, rounds: int) -> dict[str, float]:
         rounds,
     )
     total = seconds["update"]
-    ppo = (total - seconds["half_ppo"]) * epochs / (epochs - epochs // 2)
-    disc = (total - seconds["half_disc"]) * minibatches
-    disc /= minibatches - minibatches // 2
+    ppo = seconds["twice_ppo"] - total
+    disc = seconds["twice_disc"] - total
     rest = total - seconds["environment"] - ppo - disc
     return {
         "tuples_per_second": config.train.tuples_per_update / total,

@@ -2,18 +2,57 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import re
+import shlex
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from dcc_jax import physics, tasks
 from dcc_jax.config import make_config
 
-DOCS = Path(__file__).resolve().parents[1] / "docs"
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+COMMANDS = re.findall(
+    r"^python -m dcc_jax\.(.+)$", (ROOT / "README.md").read_text(), re.MULTILINE
+)
+
+
+class Understood(BaseException):
+    """In place of carrying out a command."""
+
+
+def test_readme_has_its_commands():
+    assert {command.split()[0] for command in COMMANDS} == {
+        "train",
+        "evaluate",
+        "render",
+        "curves",
+        "motion",
+    }
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_command_of_the_readme_is_understood(command, monkeypatch):
+    parse = argparse.ArgumentParser.parse_args
+
+    def understood(self, *args, **kwargs):
+        parse(self, *args, **kwargs)
+        raise Understood
+
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", understood)
+    name, *arguments = shlex.split(command, comments=True)
+    package = "dcc_jax." + name
+    if (ROOT / "src/dcc_jax" / name).is_dir():
+        package += ".__main__"
+    with pytest.raises((Understood, SystemExit)) as caught:
+        importlib.import_module(package).main(arguments)
+    assert caught.type is Understood or caught.value.code == 0
 
 
 def test_task_of_the_walkthrough_pulls_at_the_hand_as_it_says(tmp_path, monkeypatch):
