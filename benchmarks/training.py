@@ -4,8 +4,8 @@
                                   [--rounds 5] [--skip-first-update] [--skip-brax]
 
 The parts are found by what more of them costs: an update with twice the PPO epochs, one
-with twice the discriminator's minibatches, a rollout of the physics alone (kinematics, PD,
-contacts, compliance) and one with the environment around it. All take turns in one
+with twice the discriminator's minibatches, a rollout of the physics alone (kinematics,
+PD, contacts, compliance) and one with the environment around it. All take turns in one
 run, and shares are of medians. Brax's PPO, from `pip install dcc-jax[benchmark]`,
 trains the same character in `mjx.step` at the same rate, batch and widths.
 """

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dcc_jax import physics, tasks
+from dcc_jax import physics, tasks, training
 from dcc_jax.config import make_config
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -45,7 +45,11 @@ def test_command_of_the_readme_is_understood(command, monkeypatch):
         parse(self, *args, **kwargs)
         raise Understood
 
+    def prepared(*args, **kwargs):
+        raise Understood
+
     monkeypatch.setattr(argparse.ArgumentParser, "parse_args", understood)
+    monkeypatch.setattr(training, "prepare", prepared)
     name, *arguments = shlex.split(command, comments=True)
     package = "dcc_jax." + name
     if (ROOT / "src/dcc_jax" / name).is_dir():
