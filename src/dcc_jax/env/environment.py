@@ -34,6 +34,7 @@ Array = jax.Array
 CONTROL_RATE = 30  # Hz, Sec. 5.1
 CROUCH_MARGIN = 0.1  # m, by which the pelvis may be lower than in the clips
 ALPHA_ENTRY = 270 + 36 + 4  # of the observation, where alpha is
+PHASE_SIZE = 3  # of the observation, where the reference is followed in time
 
 
 @dataclass(frozen=True)
@@ -191,7 +192,8 @@ class Environment:
         lag = float(np.mean(character.kv[joints] / character.kp[joints]))
         self.demonstration_lead = 0.5 * self.control_dt + lag
         self.action_size = 36 + task.extra_actions
-        self.observation_size = 270 + 36 + 4 + 1 + task.tracks + task.state_size
+        phase_size = PHASE_SIZE if task.tracks else 0
+        self.observation_size = 270 + 36 + 4 + 1 + phase_size + task.state_size
         self.feature_size = 270
         self.condition_size = 0
         self.has_task_reward = task.has_reward
@@ -269,7 +271,7 @@ class Environment:
     def begin(self, key: Array, state: EnvState, action: Array) -> tuple[Substep, Plan]:
         """The beginning of a control step."""
         task, body = self.task.control_step(key, self.scene, state.task, state.body)
-        reference = self._following(state.reference)
+        reference = self._following(state.reference, task)
         pose = self._target_pose(reference, action)
         start = Substep(body, state.displacement, task, state.time, metrics.no_sums())
         return start, Plan(action, pose, state.alpha, reference)
@@ -313,9 +315,12 @@ class Environment:
         """
         state = self.reset(key)
         at = state.reference
-        ahead = self.references.qpos_at(at.clip, at.time + self.demonstration_lead)
-        base = self._following(at).qpos if self.task.tracks else self.nominal
-        _, wanted = self.kinematics.coords.split_q(ahead)
+        ahead = self.task.reference(
+            self.references, state.task, at, self.demonstration_lead
+        )
+        follows = self.task.tracks
+        base = self._following(at, state.task).qpos if follows else self.nominal
+        _, wanted = self.kinematics.coords.split_q(ahead.qpos)
         _, offered = self.kinematics.coords.split_q(base)
         turn = quat.log(quat.mul(quat.inv(offered), wanted))[1:]
         return state.obs, jnp.pad(turn.reshape(-1), (0, self.task.extra_actions))
@@ -328,7 +333,7 @@ class Environment:
         """The moment of the reference an episode begins at, and the start beside it."""
         clip_key, place_key = jax.random.split(key)
         begin = not self.config.random_start
-        reference = self.references.sample(clip_key, begin=begin)
+        reference = self.task.first_reference(clip_key, self.references, begin)
         if not self.task.tracks:
             reference = _at_origin(reference)
             return reference, reference
@@ -336,12 +341,11 @@ class Environment:
         away = jax.random.uniform(place_key, (2,), minval=-radius, maxval=radius)
         return reference, _moved(reference, away)
 
-    def _following(self, reference: RefState) -> RefState:
+    def _following(self, reference: RefState, task: Any) -> RefState:
         """The reference a control step later, where it is followed in time."""
         if not self.task.tracks:
             return reference
-        time = reference.time + self.control_dt
-        return self.references.state_at(reference.clip, time)
+        return self.task.reference(self.references, task, reference, self.control_dt)
 
     def _features(self, q: Array, q_previous: Array) -> Array:
         return features.body_features(self.kinematics, q, q_previous)
@@ -484,11 +488,15 @@ class Environment:
         )
 
     def _phase(self, state: EnvState) -> Array:
-        """The clip's phase [1] where it is followed in time, else [0]."""
+        """The reference's phase [3] where it is followed in time, else [0].
+
+        As it is, and as a point of the circle, where a stride's end is its beginning.
+        """
         if not self.task.tracks:
             return jnp.zeros(0)
-        at = state.reference
-        return self.references.phase_at(at.clip, at.time)[None]
+        phase = state.reference.phase
+        turn = 2.0 * jnp.pi * phase
+        return jnp.stack([phase, jnp.cos(turn), jnp.sin(turn)])
 
     def _root_target(self, state: EnvState) -> RootTarget:
         if self.task.tracks:

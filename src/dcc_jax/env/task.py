@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import mujoco
 
 from dcc_jax import physics
-from dcc_jax.motion.reference import RefState
+from dcc_jax.motion.reference import References, RefState
 
 Array = jax.Array
 
@@ -54,9 +54,9 @@ class Task:
     """Assets in `assets/motions` that a fresh install trains on."""
     has_reward: ClassVar[bool] = False
     tracks: ClassVar[bool] = False
-    """Whether the clip is followed in time (Sec. 5.4 and Appendix): its phase is
+    """Whether the reference is followed in time (Sec. 5.4 and Appendix): its phase is
     observed, actions are offsets from its pose, a tracking reward replaces the
-    discriminator's, and the world is the one the clip was made in."""
+    discriminator's, and the world is the one that `reference` moves in."""
     start_radius: ClassVar[float] = 0.0
     """m in x and y, how far beside such a clip an episode may begin."""
     extra_actions: ClassVar[int] = 0
@@ -74,6 +74,27 @@ class Task:
     def has_floor(self) -> bool:
         """Whether the soles stand on the ground plane."""
         return True
+
+    def first_reference(
+        self, key: Array, references: References, begin: bool
+    ) -> RefState:
+        """The moment of the reference at which an episode begins.
+
+        Args:
+            key: consumed.
+            references: the clips.
+            begin: at the start of a clip instead of anywhere in it.
+        """
+        return references.sample(key, begin=begin)
+
+    def reference(
+        self, references: References, state: Any, at: RefState, elapsed: float
+    ) -> RefState:
+        """The reference `elapsed` s after `at`, where it is followed in time.
+
+        Here its clip goes on. A task may have a planner instead (Sec. 4.1, Appendix).
+        """
+        return references.state_at(at.clip, at.time + elapsed)
 
     def reset(
         self, key: Array, scene: physics.Scene, reference: RefState

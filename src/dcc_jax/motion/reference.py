@@ -37,6 +37,7 @@ class RefState:
     clip: Array  # [] int32, which clip
     time: Array  # [] s, since the start of the clip
     travel: Array  # [2] m/s, mean velocity of a loop over the ground; else zero
+    phase: Array  # [] in [0, 1]
 
 
 @struct.dataclass
@@ -100,6 +101,7 @@ class References:
             clip=jnp.asarray(clip, jnp.int32),
             time=time,
             travel=self._travel(clip, time),
+            phase=self.phase_at(clip, time),
         )
 
     def sample(

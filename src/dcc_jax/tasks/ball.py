@@ -4,6 +4,10 @@ A pole pivots on the crown and carries a ball at its tip; now and then the ball 
 pushed. Six more actions are fictional forces at the head and at the root. They do not
 act in the simulation: the compliance alone hears them, so that the policy can deform
 the body, and move it, without leaving its reference.
+
+Departure: a stand is followed in time (Appendix) where the paper has a discriminator.
+Episodes that begin in the middle of a recovery step lose the ball before anything can
+be learned: they lasted 0.8 s at first and 0.9 s after 0.48 M tuples.
 """
 
 from __future__ import annotations
@@ -46,17 +50,15 @@ class Ball(Task):
     """
 
     name: ClassVar[str] = "ball"
-    clips: ClassVar[tuple[str, ...]] = (
-        "stand",
-        "balance",
-        *(f"recover_{angle:03d}" for angle in range(0, 360, 45)),
-    )
+    clips: ClassVar[tuple[str, ...]] = ("stand",)
     has_reward: ClassVar[bool] = True
+    tracks: ClassVar[bool] = True
     extra_actions: ClassVar[int] = 6
     state_size: ClassVar[int] = 12
 
-    pole_length: float = 0.7
-    """m from the pivot to the middle of the ball."""
+    pole_length: float = 1.0
+    """m from the pivot to the middle of the ball; the paper gives none. A shorter pole
+    tips faster than joints with this PD can answer."""
     pole_mass: float = 0.2
     """kg, spread along the pole."""
     ball_radius: float = 0.12

@@ -20,7 +20,7 @@ import mujoco
 from dcc_jax import physics, quat
 from dcc_jax.character import Character, add_contact, compose_scene, sole_names
 from dcc_jax.env.environment import Environment, EnvState, Plan, Substep
-from dcc_jax.motion.reference import CONTROL_DT, planar_moved
+from dcc_jax.motion.reference import CONTROL_DT, References, RefState, planar_moved
 from dcc_jax.tasks import partner
 from dcc_jax.tasks.chicken_fight import FRICTION, TARGETS, ChickenFight, State
 
@@ -30,6 +30,7 @@ RIVAL = "rival_"
 """Prefix of the second character's names."""
 ROOT = "root"
 REACH = 0.15  # m; the reference's root is so far ahead, towards the opponent
+EARLY = 0.3  # of its clip, in which a match begins
 BUMP_TIME = 1.0  # s after its beginning a bump is over
 Sides = tuple[EnvState, EnvState]
 
@@ -37,6 +38,13 @@ Sides = tuple[EnvState, EnvState]
 @dataclass(frozen=True)
 class Fighter(ChickenFight):
     """One of two: hops towards the opponent, whoever that is."""
+
+    def first_reference(
+        self, key: Array, references: References, begin: bool
+    ) -> RefState:
+        """Early in the clip, so that it lasts."""
+        at = super().first_reference(key, references, begin)
+        return references.state_at(at.clip, EARLY * at.time)
 
     def aimed(self, scene: physics.Scene, state: State, body: physics.State) -> State:
         """The reference ahead of the root, on its way to the opponent."""
@@ -229,6 +237,7 @@ def _stood(side: Environment, state: EnvState, turn: float, spot: Array) -> EnvS
     scene, body = side.scene, state.body
     angle = jnp.asarray(turn)
     about_z = quat.exp(jnp.array([0.0, 0.0, turn]))
+    reference = state.reference
     q = planar_moved(scene.character_qpos(body.qpos), angle, spot)
     qd = scene.character_qvel(body.qvel)
     qd = qd.at[:3].set(quat.rotate(about_z, qd[:3]))
@@ -238,4 +247,8 @@ def _stood(side: Environment, state: EnvState, turn: float, spot: Array) -> EnvS
         state,
         body=dataclasses.replace(body, qpos=qpos, qvel=qvel),
         q_previous=planar_moved(state.q_previous, angle, spot),
+        reference=dataclasses.replace(
+            reference, qpos=planar_moved(reference.qpos, angle, spot)
+        ),
+        task=dataclasses.replace(state.task, facing=angle),
     )
