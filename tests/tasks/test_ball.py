@@ -114,7 +114,7 @@ def tipping(pinned) -> np.ndarray:
 
     def fall(qpos):
         body = physics.initial_state(pinned, qpos, jnp.zeros(pinned.model.nv))
-        return jax.lax.scan(step, body, None, length=120)[1]
+        return jax.lax.scan(step, body, None, length=180)[1]
 
     return np.arccos(np.asarray(jax.jit(fall)(start), float))
 

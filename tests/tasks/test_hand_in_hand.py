@@ -12,11 +12,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from dcc_jax import physics
+from dcc_jax import physics, quat
 from dcc_jax.character import asset_path, compose_scene, load_character
-from dcc_jax.env.task import RootTarget
 from dcc_jax.motion.clip import load_clip
-from dcc_jax.motion.reference import CONTROL_DT, RefState, make_references
+from dcc_jax.motion.reference import (
+    CONTROL_DT,
+    References,
+    RefState,
+    make_references,
+)
 from dcc_jax.tasks import hand_in_hand, partner
 from dcc_jax.tasks.hand_in_hand import HandInHand
 
@@ -41,6 +45,12 @@ def reference() -> RefState:
     shift[:2] = state.qpos[:2]
     return dataclasses.replace(
         state, qpos=state.qpos - shift, qpos_previous=state.qpos_previous - shift
+    )
+
+
+def _references() -> References:
+    return make_references(
+        [load_clip(asset_path(f"motions/{name}.npz")) for name in TASK.clips]
     )
 
 
@@ -200,15 +210,22 @@ def test_hand_velocity_is_the_rate_of_its_position(scene, reference):
         np.testing.assert_allclose(velocity, (ends[1] - ends[0]) / 4e-3, atol=0.02)
 
 
-def test_the_reference_root_runs_beside_the_partner(scene, reference):
-    state, _, _ = TASK.reset(jax.random.key(4), scene, reference)
-    rest = RootTarget(jnp.zeros(2), jnp.zeros(2))
-    for time in (0.0, CONTROL_DT):
-        target = TASK.root_target(scene, state, rest, jnp.array(time))
-        np.testing.assert_allclose(target.velocity, reference.qvel[:2], atol=1e-4)
-        np.testing.assert_allclose(
-            target.position, time * np.array(reference.qvel[:2]), atol=1e-5
-        )
+@pytest.mark.parametrize("elapsed", [CONTROL_DT, 0.1])
+def test_the_reference_runs_beside_the_partner(scene, elapsed):
+    references = _references()
+    begins = TASK.first_reference(jax.random.key(9), references, False)
+    state, _, _ = TASK.reset(jax.random.key(4), scene, begins)
+    turning = dataclasses.replace(state.motion, turn=jnp.array(0.5))
+    state = dataclasses.replace(state, motion=turning)
+    later = TASK.reference(references, state, begins, elapsed)
+    position, heading, speed = partner.path(state.motion, begins.time + elapsed)
+    np.testing.assert_allclose(later.qpos[:2], position, atol=1e-6)
+    way = speed * np.array([np.cos(heading), np.sin(heading)])
+    np.testing.assert_allclose(later.qvel[:2], way, atol=1e-6)
+    ahead = quat.rotate(quat.heading(later.qpos[3:7]), jnp.array([1.0, 0.0, 0.0]))
+    off = np.arctan2(ahead[1], ahead[0]) - heading
+    assert abs(off) < 0.15, "but for the turns of the pelvis in a stride"
+    np.testing.assert_allclose(later.time - begins.time, elapsed, atol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(4))

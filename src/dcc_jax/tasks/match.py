@@ -238,7 +238,10 @@ def _stood(side: Environment, state: EnvState, turn: float, spot: Array) -> EnvS
     angle = jnp.asarray(turn)
     about_z = quat.exp(jnp.array([0.0, 0.0, turn]))
     reference = state.reference
-    q = planar_moved(scene.character_qpos(body.qpos), angle, spot)
+    here = scene.character_qpos(body.qpos)
+    # It turns about the world's origin, and stands beside that already.
+    spot = spot - planar_moved(here, angle, jnp.zeros(2))[:2]
+    q = planar_moved(here, angle, spot)
     qd = scene.character_qvel(body.qvel)
     qd = qd.at[:3].set(quat.rotate(about_z, qd[:3]))
     qpos = jax.lax.dynamic_update_slice(body.qpos, q, (scene.qpos_adr,))

@@ -108,10 +108,7 @@ def begin(
     before = loops.pose(references, earlier, speed, zero - dt).at[0].set(-dt * speed)
     return RefState(
         qpos=now,
-        qvel=quat.log_map(
-            references.coords, quat.ominus(references.coords, now, before)
-        )
-        / dt,
+        qvel=_rate(references.coords, before, now, dt),
         qpos_previous=before,
         clip=jnp.zeros((), jnp.int32),
         time=zero,
@@ -146,6 +143,14 @@ def go_on(
         travel=velocity,
         phase=phase,
     )
+
+
+def _rate(coords: quat.Coordinates, before: Array, now: Array, dt: float) -> Array:
+    """The velocity [42] that leads from one pose to another within dt s."""
+    scalars, quats = coords.split_q(before)
+    later_scalars, later_quats = coords.split_q(now)
+    turned = quat.log(quat.mul(quat.inv(quats), later_quats))
+    return coords.join_v((later_scalars - scalars) / dt, turned / dt)
 
 
 def _offset(references: References, clip: int) -> float:

@@ -1,0 +1,120 @@
+"""The planner of strides: loops at their own speeds, something between elsewhere."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from dcc_jax.character import asset_path, compose_scene, load_character
+from dcc_jax.motion.clip import load_clip
+from dcc_jax.motion.reference import CONTROL_DT, References, make_references
+from dcc_jax.tasks import strides
+from dcc_jax.tasks.hand_in_hand import HandInHand
+
+PHASES = np.arange(48) / 48
+
+
+def _references(*names: str) -> References:
+    return make_references(
+        [load_clip(asset_path(f"motions/{name}.npz")) for name in names]
+    )
+
+
+@pytest.fixture(scope="module")
+def references() -> References:
+    return _references(*HandInHand.clips)
+
+
+@pytest.fixture(scope="module")
+def loops(references) -> strides.Strides:
+    return strides.strides(references)
+
+
+@pytest.fixture(scope="module")
+def pose(references, loops):
+    """(phase, speed, time) -> qpos [55]."""
+    return jax.jit(lambda *at: loops.pose(references, *at))
+
+
+def _apart(references, qpos) -> np.ndarray:
+    """How far the left foot is ahead of the right one at each pose, m."""
+    model = compose_scene(load_character(), floor=False)
+    data = mujoco.MjData(model)
+    gaps = []
+    for q in qpos:
+        data.qpos[:] = q
+        mujoco.mj_kinematics(model, data)
+        gaps.append(data.body("left_foot").xpos[0] - data.body("right_foot").xpos[0])
+    return np.array(gaps)
+
+
+def test_loops_come_in_the_order_of_their_speeds(references, loops):
+    names = [references.names[clip] for clip in loops.clips]
+    assert names[0] == "stand" and names[-1] == "run_cycle"
+    assert list(loops.speeds) == sorted(loops.speeds)
+    assert loops.cadences[0] == loops.cadences[1], "who begins to walk has a cadence"
+
+
+def test_at_the_speed_of_a_loop_it_is_that_loop(references, loops, pose):
+    for index in range(1, len(loops.clips)):
+        clip, speed = loops.clips[index], loops.speeds[index]
+        for phase in (0.1, 0.6):
+            stride = (phase + loops.offsets[index]) % 1.0
+            own = references.qpos_at(clip, stride * references.duration[clip])
+            made = pose(jnp.array(phase), jnp.array(speed), jnp.zeros(()))
+            off = np.abs(np.array(made[2:]) - np.array(own[2:])).max()
+            assert off < 2e-3, references.names[clip]
+
+
+def test_all_loops_put_the_left_foot_forward_at_one_phase(references, loops, pose):
+    peaks = []
+    for speed in loops.speeds[1:]:
+        qpos = [pose(jnp.array(p), jnp.array(speed), jnp.zeros(())) for p in PHASES]
+        wave = np.fft.fft(_apart(references, qpos))[1]
+        peaks.append(np.angle(wave))
+    off = np.angle(np.exp(1j * (np.array(peaks) - peaks[0])))
+    assert np.abs(off).max() < 0.6, "a tenth of a stride"
+
+
+def test_strides_grow_with_speed(references, pose):
+    widths = []
+    for speed in (0.0, 0.4, 0.8, 1.2, 1.6):
+        qpos = [pose(jnp.array(p), jnp.array(speed), jnp.zeros(())) for p in PHASES]
+        widths.append(np.ptp(_apart(references, qpos)))
+    assert widths[0] < 0.02 and np.all(np.diff(widths) > 0.1)
+
+
+@pytest.mark.parametrize("speed", [0.0, 1.0, 2.6])
+def test_what_it_begins_with_moves_as_it_says(references, loops, speed):
+    state = strides.begin(
+        references, loops, jnp.array(0.3), jnp.array(speed), CONTROL_DT
+    )
+    np.testing.assert_allclose(state.qpos[:2], 0.0)
+    np.testing.assert_allclose(state.qvel[:2], [speed, 0.0], atol=1e-4)
+    np.testing.assert_allclose(state.travel, [speed, 0.0])
+    model = compose_scene(load_character(), floor=False)
+    gone = np.zeros(42)
+    mujoco.mj_differentiatePos(
+        model,
+        gone,
+        CONTROL_DT,
+        np.array(state.qpos_previous, float),
+        np.array(state.qpos, float),
+    )
+    np.testing.assert_allclose(state.qvel, gone, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("names", "reason"),
+    [
+        (("walk_cycle", "walk"), "clips must be loops, walk is none"),
+        (("walk_cycle",), "two loops or more"),
+        (("walk_cycle", "walk_cycle"), "different speeds"),
+    ],
+)
+def test_clips_that_make_no_planner_are_refused(names, reason):
+    with pytest.raises(ValueError, match=reason):
+        strides.strides(_references(*names))
