@@ -71,14 +71,15 @@ class Strides:
         return references.qpos_at(clip, at)
 
 
+@jax.ensure_compile_time_eval()
 def strides(references: References) -> Strides:
-    """The loops of the references as strides; numpy, at trace time.
+    """The loops of the references as strides; known before anything is traced.
 
     Raises:
         ValueError: a clip is no loop, fewer than two of them, none that strides, or two
             of one speed.
     """
-    for name, loop in zip(references.names, references.loop, strict=True):
+    for name, loop in zip(references.names, np.asarray(references.loop), strict=True):
         if not loop:
             raise ValueError(f"clips must be loops, {name} is none")
     duration = np.asarray(references.duration)
