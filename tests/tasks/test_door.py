@@ -10,7 +10,7 @@ import pytest
 
 from dcc_jax import physics
 from dcc_jax.character import Character, asset_path, compose_scene
-from dcc_jax.env.environment import EnvConfig, Environment
+from dcc_jax.env.environment import PHASE_SIZE, EnvConfig, Environment
 from dcc_jax.motion import author_door
 from dcc_jax.motion.clip import Clip, load_clip
 from dcc_jax.motion.reference import make_references
@@ -279,7 +279,9 @@ def test_the_hand_takes_hold_near_the_knob_and_lets_go_on_time(played):
 
 
 def test_the_phase_goes_on_and_the_clip_is_followed(environment, played):
-    phase = np.asarray(played.obs)[:, :, -(TASK.state_size + 1)]
+    seen = np.asarray(played.obs)[:, :, -(TASK.state_size + PHASE_SIZE) :]
+    phase, cos, sin = np.moveaxis(seen[:, :, :PHASE_SIZE], -1, 0)
+    np.testing.assert_allclose(cos + 1j * sin, np.exp(2j * np.pi * phase), atol=1e-5)
     np.testing.assert_allclose(np.diff(phase), 1 / 150, rtol=1e-3)
     np.testing.assert_allclose(
         phase[:, 0], (np.array([0.2, 1.0, 2.0, 3.95]) + 1 / 30) / 5.0, rtol=1e-3
