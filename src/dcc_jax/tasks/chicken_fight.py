@@ -7,8 +7,8 @@ a path of its own. The contact forces with the opponent, one resultant a body, f
 compliance. `tasks.match` lets two characters fight each other.
 
 Departure: the paper trains with the discriminator. Hops have little in common with what
-a falling body does, and 0.65 M tuples took episodes from 0.8 to 1.3 s only
-(docs/results.md); with the clip's time known (Appendix) they are learned.
+a falling body does, and 0.66 M tuples took episodes from 0.8 to 1.3 s only; the clip's
+time is known here (Appendix). That is not learned yet either (docs/results.md).
 """
 
 from __future__ import annotations
