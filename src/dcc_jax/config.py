@@ -84,8 +84,8 @@ def _smoke(config: Config) -> Config:
 def _cpu(config: Config) -> Config:
     """Many small updates, one pass over each: tuples are dear, and so is the learner.
 
-    Two cores spend more time on four passes than on the physics, and learn no more from
-    them, because `target_kl` bounds what an update may change (docs/performance.md).
+    Four passes took half of an update, and taught no more: `target_kl` bounds what an
+    update may change (docs/performance.md).
     """
     return dataclasses.replace(
         config,

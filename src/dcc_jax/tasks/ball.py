@@ -57,8 +57,8 @@ class Ball(Task):
     state_size: ClassVar[int] = 12
 
     pole_length: float = 1.0
-    """m from the pivot to the middle of the ball; the paper gives none. A shorter pole
-    tips faster than joints with this PD can answer."""
+    """m from the pivot to the middle of the ball; the paper gives none. A longer pole
+    tips more slowly."""
     pole_mass: float = 0.2
     """kg, spread along the pole."""
     ball_radius: float = 0.12

@@ -3,7 +3,7 @@
 The force fed to the compliance is the strongest contact of a ball with the character.
 
 The ball slides along x, y and z and does not spin: its unknowns are coupled with all of
-the character's, and three of them instead of six take a quarter off a physics step.
+the character's, and three of them instead of six make those matrices smaller.
 """
 
 from __future__ import annotations
