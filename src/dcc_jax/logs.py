@@ -116,9 +116,16 @@ def progress_line(metrics: dict[str, float], total: int) -> str:
         f"(q {metrics['reward/r_q']:.2f} p {metrics['reward/r_p']:.2f} "
         f"task {metrics['reward/r_task']:.2f})  "
         f"episode {metrics['episode/length']:.0f} steps, "
-        f"falls {metrics['episode/fall_rate']:.0%}  "
-        f"D {metrics['disc/accuracy_real']:.0%}/{metrics['disc/accuracy_fake']:.0%}"
+        f"falls {metrics['episode/fall_rate']:.0%}" + _of_discriminator(metrics)
     )
+
+
+def _of_discriminator(metrics: dict[str, float]) -> str:
+    """Shares it judged right; nothing for a task that follows its clip in time."""
+    if "disc/accuracy_real" not in metrics:
+        return ""
+    real, fake = metrics["disc/accuracy_real"], metrics["disc/accuracy_fake"]
+    return f"  D {real:.0%}/{fake:.0%}"
 
 
 def _clock(seconds: float) -> str:

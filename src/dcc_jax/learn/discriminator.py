@@ -138,8 +138,8 @@ def update(
         axis_name: mesh axis of the devices.
 
     Returns:
-        The network after M steps, and metrics averaged over them; a step whose gradient
-        is not finite is left out and counted in `disc/skipped`.
+        The network after M steps, and this device's metrics averaged over them; a step
+        whose gradient is not finite is left out and counted in `disc/skipped`.
     """
     optimizer = networks.clipped_adam(config.max_gradient_norm)
 
@@ -154,8 +154,7 @@ def update(
 
     network, metrics = jax.lax.scan(step, network, (expert, policy))
     skipped = jnp.sum(metrics.pop("disc/skipped"))
-    means = jax.lax.pmean(jax.tree.map(jnp.mean, metrics), axis_name)
-    return network, means | {"disc/skipped": skipped}
+    return network, jax.tree.map(jnp.mean, metrics) | {"disc/skipped": skipped}
 
 
 def _require(ok: bool, name: str, value: object, allowed: str) -> None:

@@ -1,6 +1,6 @@
 """Running mean and variance of observations, stable in float32.
 
-Letters: N samples, O observation size.
+Letters: N samples, O observation size, D devices.
 """
 
 from __future__ import annotations
@@ -26,42 +26,39 @@ class Normalizer:
     variance: Array  # [O]
 
 
-def init_normalizer(x: Array, axis_name: str | None = None) -> Normalizer:
-    """Moments of a first batch x [N, O], over all devices of the axis."""
-    count, mean, variance = _moments(x, axis_name)
-    return Normalizer(count=count, mean=mean, variance=variance)
+def moments(x: Array) -> Normalizer:
+    """Moments of samples x [N, O]."""
+    mean = jnp.mean(x, axis=0)
+    variance = jnp.mean((x - mean) ** 2, axis=0)
+    return Normalizer(jnp.asarray(x.shape[0], jnp.float32), mean, variance)
 
 
-def update(n: Normalizer, x: Array, axis_name: str | None = None) -> Normalizer:
-    """Merges the moments of a batch x [N, O] (Chan, Golub, LeVeque 1979).
+def merge(n: Normalizer, more: Normalizer) -> Normalizer:
+    """Moments of two sets together (Chan, Golub, LeVeque 1979).
 
-    The moments of two sets are combined through their difference of means, so no large
-    sums are ever subtracted.
+    They are combined through their difference of means, so no large sums are ever
+    subtracted.
     """
-    count, mean, variance = _moments(x, axis_name)
-    total = n.count + count
-    delta = mean - n.mean
-    share = count / total
+    total = n.count + more.count
+    delta = more.mean - n.mean
+    share = more.count / total
     return Normalizer(
         count=total,
         mean=n.mean + delta * share,
         variance=n.variance
-        + (variance - n.variance) * share
+        + (more.variance - n.variance) * share
         + delta * delta * share * (1.0 - share),
     )
+
+
+def pooled(parts: Normalizer) -> Normalizer:
+    """Moments of D equally large sets together, each leaf [D, ...]."""
+    mean = jnp.mean(parts.mean, axis=0)
+    variance = jnp.mean(parts.variance + (parts.mean - mean) ** 2, axis=0)
+    return Normalizer(jnp.sum(parts.count), mean, variance)
 
 
 def normalize(n: Normalizer, x: Array) -> Array:
     """(x - mean) / std of x [..., O], clipped to +-10."""
     std = jnp.maximum(jnp.sqrt(n.variance), MIN_STD)
     return jnp.clip((x - n.mean) / std, -CLIP, CLIP)
-
-
-def _moments(x: Array, axis_name: str | None) -> tuple[Array, Array, Array]:
-    def over_devices(local: Array) -> Array:
-        return local if axis_name is None else jax.lax.pmean(local, axis_name)
-
-    devices = 1 if axis_name is None else jax.lax.axis_size(axis_name)
-    mean = over_devices(jnp.mean(x, axis=0))
-    variance = over_devices(jnp.mean((x - mean) ** 2, axis=0))
-    return jnp.asarray(x.shape[0] * devices, jnp.float32), mean, variance

@@ -215,8 +215,8 @@ def update(
         axis_name: mesh axis over which gradients are averaged.
 
     Returns:
-        The agent after, and metrics averaged over the steps; steps whose gradient is
-        not finite are left out and counted in `ppo/skipped`.
+        The agent after, and this device's metrics averaged over the steps; steps whose
+        gradient is not finite are left out and counted in `ppo/skipped`.
     """
     tuples = batch.log_prob.shape[0]
     size = config.minibatch_size // jax.lax.axis_size(axis_name)
@@ -230,8 +230,7 @@ def update(
 
     agent, metrics = jax.lax.scan(step, agent, rows)
     skipped = jnp.sum(metrics.pop("ppo/skipped"))
-    means = jax.lax.pmean(jax.tree.map(jnp.mean, metrics), axis_name)
-    return agent, means | {
+    return agent, jax.tree.map(jnp.mean, metrics) | {
         "ppo/skipped": skipped,
         "ppo/learning_rate": agent.learning_rate,
     }

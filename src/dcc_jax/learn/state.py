@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from dcc_jax.env.rewards import RewardConfig
 from dcc_jax.learn import networks, normalizer, ppo, warm_start
 from dcc_jax.learn.discriminator import DiscriminatorConfig
+from dcc_jax.learn.exchange import gathered
 from dcc_jax.learn.ppo import PpoConfig
 from dcc_jax.learn.rollout import Environment, Incident, Running, reset_all
 
@@ -139,17 +140,18 @@ def init_state(
         local_envs: B.
     """
     key, agent_key, disc_key, reset_key, expert_key, warm_key = jax.random.split(key, 6)
+    lesson_key, moments_key = jax.random.split(of_device(warm_key))
     reset_keys = jax.random.split(of_device(reset_key), local_envs)
     running = reset_all(reset_keys, environment, alpha)
-    obs_normalizer = normalizer.init_normalizer(running.env.obs, AXIS)
+    obs = running.env.obs
     agent = ppo.init_agent(
         agent_key, environment.observation_size, environment.action_size, config.ppo
     )
     if config.train.warm_start_steps:
-        lesson_key, moments_key = jax.random.split(of_device(warm_key))
         keys = jax.random.split(moments_key, config.train.unroll_length * local_envs)
         obs, _ = jax.vmap(environment.demonstration)(keys)
-        obs_normalizer = normalizer.init_normalizer(obs, AXIS)
+    obs_normalizer = normalizer.pooled(gathered(normalizer.moments(obs), AXIS))
+    if config.train.warm_start_steps:
         agent = warm_start.warm_start(
             lesson_key,
             agent,
@@ -167,7 +169,7 @@ def init_state(
         agent=agent,
         disc=networks.init_network(disc, optimizer),
         obs_normalizer=obs_normalizer,
-        feature_normalizer=normalizer.init_normalizer(s),
+        feature_normalizer=normalizer.moments(s),
         running=running,
         alpha=alpha,
         key=key,

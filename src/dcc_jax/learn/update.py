@@ -17,6 +17,8 @@ import jax.numpy as jnp
 from dcc_jax.env import rewards
 from dcc_jax.learn import discriminator, networks, normalizer, ppo
 from dcc_jax.learn.discriminator import Pairs
+from dcc_jax.learn.exchange import gathered
+from dcc_jax.learn.normalizer import Normalizer
 from dcc_jax.learn.ppo import PpoConfig
 from dcc_jax.learn.rollout import (
     Actors,
@@ -66,32 +68,28 @@ def update_state(
         config.ppo,
         chunk_size(config.train, state.running.steps.shape[0]),
     )
-    disc, disc_metrics, expert = _train_discriminator(
-        of_device(disc_key), state, taken.transitions.pairs, environment, config
-    )
-    reward, reward_metrics = _rewards(
-        disc.params, state, taken.transitions, environment, config
-    )
+    metrics = _env_metrics(taken.env_metrics)
+    seen = {"obs": normalizer.moments(_flat(taken.transitions.obs))}
+    if not environment.tracks:
+        disc, of_disc, features = _train_discriminator(
+            of_device(disc_key), state, taken.transitions.pairs, environment, config
+        )
+        metrics |= of_disc
+        seen |= {"features": features}
+        state = dataclasses.replace(state, disc=disc)
+    reward, of_reward = _rewards(state, taken.transitions, environment, config)
     batch = _ppo_batch(state, taken, reward, config.ppo)
-    agent, ppo_metrics = ppo.update(
-        of_device(ppo_key), state.agent, batch, config.ppo, AXIS
-    )
-    state, episode_metrics = _counted(state, taken.transitions)
+    agent, of_ppo = ppo.update(of_device(ppo_key), state.agent, batch, config.ppo, AXIS)
+    metrics |= of_reward | of_ppo
+    episodes = _episodes(taken.transitions)
+    metrics, seen, episodes = gathered((metrics, seen, episodes), AXIS)
+    metrics = jax.tree.map(lambda x: jnp.mean(x, axis=0), metrics)
+    state, of_episodes = _counted(state, episodes)
     state = dataclasses.replace(
-        state,
-        agent=agent,
-        disc=disc,
-        obs_normalizer=normalizer.update(
-            state.obs_normalizer, _flat(taken.transitions.obs), AXIS
-        ),
-        feature_normalizer=_features_seen(state, taken.transitions.pairs, expert),
-        running=taken.running,
-        key=key,
+        _seen(state, seen), agent=agent, running=taken.running, key=key
     )
-    means = jax.lax.pmean(reward_metrics | _env_metrics(taken.env_metrics), AXIS)
-    metrics = means | disc_metrics | ppo_metrics | episode_metrics
     incident = jax.tree.map(lambda x: x[None], taken.incident)
-    return state, UpdateReport(metrics=metrics, incident=incident)
+    return state, UpdateReport(metrics=metrics | of_episodes, incident=incident)
 
 
 def _train_discriminator(
@@ -100,8 +98,11 @@ def _train_discriminator(
     pairs: Pairs,
     environment: Environment,
     config: LearnerConfig,
-) -> tuple[networks.Network, dict[str, Array], Array]:
-    """The discriminator after its minibatches, and the clip features it saw [N, F]."""
+) -> tuple[networks.Network, dict[str, Array], Normalizer]:
+    """The discriminator after its minibatches, metrics, and moments of the features.
+
+    Policy and clip count in equal shares in them, as the discriminator sees them.
+    """
     size = config.disc.minibatch_size // jax.lax.axis_size(AXIS)
     count = config.disc.minibatches * size
     expert_key, row_key = jax.random.split(key)
@@ -117,11 +118,11 @@ def _train_discriminator(
     disc, metrics = discriminator.update(
         state.disc, minibatches(expert), minibatches(policy), config.disc, AXIS
     )
-    return disc, metrics, expert.s_next
+    both = jnp.concatenate([policy.s_next, expert.s_next])
+    return disc, metrics, normalizer.moments(both)
 
 
 def _rewards(
-    params: networks.Mlp,
     state: TrainState,
     transitions: Transition,
     environment: Environment,
@@ -133,7 +134,7 @@ def _rewards(
         r_q = transitions.r_q
     else:
         x = discriminator.inputs(state.feature_normalizer, transitions.pairs)
-        r_q = rewards.pose_reward(discriminator.score(params, x), weights)
+        r_q = rewards.pose_reward(discriminator.score(state.disc.params, x), weights)
     r_task = transitions.r_task if environment.has_task_reward else None
     total = rewards.reward(r_q, transitions.r_p, weights, r_task)
     return total, {
@@ -163,38 +164,40 @@ def _ppo_batch(
         config.discount,
         config.gae_lambda,
     )
-    mean = jax.lax.pmean(jnp.mean(advantage), AXIS)
-    variance = jax.lax.pmean(jnp.mean((advantage - mean) ** 2), AXIS)
+    local = normalizer.moments(advantage.reshape(-1))
+    spread = normalizer.pooled(gathered(local, AXIS))
     return ppo.Batch(
         obs=_flat(obs),
         action=_flat(transitions.action),
         log_prob=_flat(transitions.log_prob),
-        advantage=_flat((advantage - mean) / (jnp.sqrt(variance) + 1e-6)),
+        advantage=_flat((advantage - spread.mean) / (jnp.sqrt(spread.variance) + 1e-6)),
         target=_flat(advantage + values),
     )
 
 
+def _episodes(transitions: Transition) -> dict[str, Array]:
+    """Counts of this device's episodes."""
+    return {
+        "ended": jnp.sum(transitions.length > 0),
+        "steps": jnp.sum(transitions.length),
+        "fallen": jnp.sum(transitions.terminated),
+        "broken": jnp.sum(transitions.nan),
+    }
+
+
 def _counted(
-    state: TrainState, transitions: Transition
+    state: TrainState, episodes: dict[str, Array]
 ) -> tuple[TrainState, dict[str, Array]]:
     """The counters after this update; with no episode ended, the last figures stay."""
-    lengths = transitions.length.astype(jnp.float32)
-    ended, steps, fallen, broken = jax.lax.psum(
-        (
-            jnp.sum(transitions.length > 0),
-            jnp.sum(lengths),
-            jnp.sum(transitions.terminated),
-            jnp.sum(transitions.nan),
-        ),
-        AXIS,
-    )
-    some = jnp.maximum(ended, 1)
+    total = {name: jnp.sum(of_devices) for name, of_devices in episodes.items()}
+    ended, some = total["ended"], jnp.maximum(total["ended"], 1)
+    length, fall_rate = total["steps"] / some, total["fallen"] / some
     state = dataclasses.replace(
         state,
         update=state.update + 1,
-        nan_count=state.nan_count + broken,
-        episode_length=jnp.where(ended > 0, steps / some, state.episode_length),
-        fall_rate=jnp.where(ended > 0, fallen / some, state.fall_rate),
+        nan_count=state.nan_count + total["broken"],
+        episode_length=jnp.where(ended > 0, length, state.episode_length),
+        fall_rate=jnp.where(ended > 0, fall_rate, state.fall_rate),
     )
     return state, {
         "episode/length": state.episode_length,
@@ -204,13 +207,15 @@ def _counted(
     }
 
 
-def _features_seen(
-    state: TrainState, pairs: Pairs, expert: Array
-) -> normalizer.Normalizer:
-    """Policy and clip features in equal shares, as the discriminator sees them."""
-    policy = _flat(pairs.s_next)[: expert.shape[0]]
-    both = jnp.concatenate([policy, expert[: policy.shape[0]]])
-    return normalizer.update(state.feature_normalizer, both, AXIS)
+def _seen(state: TrainState, of_devices: dict[str, Normalizer]) -> TrainState:
+    """The normalisers with what the devices saw in this update."""
+    seen = {name: normalizer.pooled(parts) for name, parts in of_devices.items()}
+    obs = normalizer.merge(state.obs_normalizer, seen["obs"])
+    state = dataclasses.replace(state, obs_normalizer=obs)
+    if "features" in seen:
+        features = normalizer.merge(state.feature_normalizer, seen["features"])
+        state = dataclasses.replace(state, feature_normalizer=features)
+    return state
 
 
 def _env_metrics(metrics: Any) -> dict[str, Array]:

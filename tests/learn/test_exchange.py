@@ -1,0 +1,103 @@
+"""Exchanges between devices happen in one order that the data enforces."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
+from jax.sharding import NamedSharding, PartitionSpec
+
+from dcc_jax import config, tasks
+from dcc_jax.learn import learner
+from dcc_jax.learn.exchange import gathered
+
+EXCHANGES = {"psum", "psum_invariant", "all_gather", "pmax", "pmin", "ppermute"}
+LOOPS = {"scan", "while"}
+
+
+def _inner(equation: JaxprEqn) -> list[Jaxpr]:
+    parts = jax.tree.leaves(
+        list(equation.params.values()), is_leaf=lambda x: isinstance(x, Jaxpr)
+    )
+    parts = [p.jaxpr if isinstance(p, ClosedJaxpr) else p for p in parts]
+    return [p for p in parts if isinstance(p, Jaxpr)]
+
+
+def _exchanges(equation: JaxprEqn) -> bool:
+    return equation.primitive.name in EXCHANGES or any(
+        _exchanges(inner) for jaxpr in _inner(equation) for inner in jaxpr.eqns
+    )
+
+
+def _unordered(jaxpr: Jaxpr) -> list[str]:
+    """Pairs of exchanges, one of them in a loop, that may run side by side."""
+    found: list[str] = []
+    after: dict = {}  # variable: numbers of the exchanges its value depends on
+    before: list[JaxprEqn] = []
+    for equation in jaxpr.eqns:
+        known = [
+            after.get(v, set()) for v in equation.invars if not isinstance(v, Literal)
+        ]
+        depends = set().union(*known)
+        if _exchanges(equation):
+            for i, earlier in enumerate(before):
+                names = {earlier.primitive.name, equation.primitive.name}
+                if i not in depends and not names <= EXCHANGES:
+                    found.append(f"{earlier.primitive.name}, {equation.primitive.name}")
+            depends = depends | {len(before)}
+            before.append(equation)
+        for variable in equation.outvars:
+            after[variable] = depends
+        for inner in _inner(equation):
+            found += _unordered(inner)
+    return found
+
+
+@pytest.mark.parametrize("task", ["push", "door"])  # imitates, and follows in time
+def test_programs_leave_no_exchange_beside_a_loop_with_exchanges(task):
+    run = config.make_config(task, "smoke")
+    environment = tasks.make_environment(run)
+    mesh = learner.make_mesh(run.train)
+    init = learner.make_init(environment, run, mesh)
+    key = jax.random.key(0)
+    state = jax.eval_shape(init, key, None)
+    update = learner.make_update(environment, run, mesh)
+    for program in (jax.make_jaxpr(init)(key, None), jax.make_jaxpr(update)(state)):
+        assert any(_exchanges(equation) for equation in program.jaxpr.eqns)
+        assert not _unordered(program.jaxpr)
+
+
+def _over_devices(f, x):
+    """The function f of x, which the devices share."""
+    mesh = learner.make_mesh(config.make_config("push", "smoke").train)
+    spec = PartitionSpec("env")
+    f = jax.shard_map(f, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
+    return f, jax.device_put(x, NamedSharding(mesh, spec))
+
+
+def test_exchange_beside_a_loop_with_exchanges_is_found():
+    def both(x):
+        mean = jax.lax.pmean(x, "env")
+        looped, _ = jax.lax.scan(
+            lambda y, _: (jax.lax.pmean(y, "env"), None), x, length=3
+        )
+        return mean + looped
+
+    program, x = _over_devices(both, jnp.ones(2 * len(jax.devices())))
+    (shared,) = jax.make_jaxpr(program)(x).jaxpr.eqns
+    found = _unordered(*_inner(shared))
+    assert found == ["psum, scan"]
+
+
+def test_gathered_keeps_structure_and_types_and_the_order_of_devices():
+    devices = len(jax.devices())
+
+    def here(x):
+        mine = {"index": jax.lax.axis_index("env"), "x": x}
+        return jax.tree.map(lambda leaf: leaf[None], gathered(mine, "env"))
+
+    program, x = _over_devices(here, jnp.arange(3.0 * devices))
+    of_all = jax.jit(program)(x)
+    assert of_all["index"].dtype == jnp.int32
+    for index, x_all in zip(of_all["index"], of_all["x"], strict=True):
+        assert list(index) == list(range(devices))
+        assert jnp.array_equal(x_all.reshape(-1), x)
