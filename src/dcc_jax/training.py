@@ -6,6 +6,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -131,8 +132,7 @@ def execute(run: Run, *, quiet: bool = False) -> TrainResult:
 
 def _loop(run: Run, progress: logs.Progress, stop: _StopSignal) -> TrainResult:
     train = run.config.train
-    state = _first_state(run, progress.say)
-    update = _compiled(run, state, progress.say)
+    state, update = _prepared(run, progress.say)
     measure_style = jax.jit(partial(style.of_running, run.environment))
     done, nan_count = int(state.update), int(state.nan_count)
     log = logs.RunLog(run.run_dir, done)
@@ -166,12 +166,27 @@ def _loop(run: Run, progress: logs.Progress, stop: _StopSignal) -> TrainResult:
     return _finish(run, done, state, stop, progress.say)
 
 
-def _first_state(run: Run, say: Callable[[str], None]) -> TrainState:
-    """From the last checkpoint, or drawn from the seed where there is none yet."""
+def _prepared(
+    run: Run, say: Callable[[str], None]
+) -> tuple[TrainState, learner.Update]:
+    """The first state and the compiled update, which compile side by side."""
     init = learner.make_init(run.environment, run.config, run.mesh)
+    template = jax.eval_shape(init, jax.random.key(run.config.seed), None)
+    with ThreadPoolExecutor(1) as beside:
+        update = beside.submit(_compiled, run, template, say)
+        state = _first_state(run, init, template, say)
+        return state, update.result()
+
+
+def _first_state(
+    run: Run,
+    init: learner.Init,
+    template: TrainState,
+    say: Callable[[str], None],
+) -> TrainState:
+    """From the last checkpoint, or drawn from the seed where there is none yet."""
     key = jax.random.key(run.config.seed)
     if run.resume:
-        template = jax.eval_shape(init, key, None)
         found = checkpoint.restore_latest(run.run_dir, template, say)
         if found is not None:
             update, arrays = found
@@ -181,12 +196,18 @@ def _first_state(run: Run, say: Callable[[str], None]) -> TrainState:
 
 
 def _compiled(
-    run: Run, state: TrainState, say: Callable[[str], None]
+    run: Run, template: TrainState, say: Callable[[str], None]
 ) -> learner.Update:
     say(f"compiling for {run.mesh.size} {jax.default_backend()} device(s) ...")
     began = time.perf_counter()
     update = learner.make_update(run.environment, run.config, run.mesh)
-    compiled = update.lower(state).compile()
+    shardings = learner.state_shardings(run.mesh, template)
+    sharded = jax.tree.map(
+        lambda x, at: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=at),
+        template,
+        shardings,
+    )
+    compiled = update.lower(sharded).compile()
     say(f"compiled in {time.perf_counter() - began:.1f} s")
     return compiled
 
