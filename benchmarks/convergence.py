@@ -22,7 +22,8 @@ import numpy as np  # noqa: E402
 
 from dcc_jax import physics, tasks  # noqa: E402
 from dcc_jax.config import make_config  # noqa: E402
-from dcc_jax.env.environment import Environment, EnvState  # noqa: E402
+from dcc_jax.env.environment import Environment  # noqa: E402
+from dcc_jax.env.state import EnvState  # noqa: E402
 
 Array = jax.Array
 AT_MOST, CONVERGED = (2, 3, 4, 5, 6, 8), 24

@@ -41,7 +41,9 @@ from dcc_jax import physics, tasks  # noqa: E402
 from dcc_jax.character import compose_scene, load_character  # noqa: E402
 from dcc_jax.config import Config, make_config  # noqa: E402
 from dcc_jax.control import pd  # noqa: E402
-from dcc_jax.env.environment import CONTROL_RATE, Environment, EnvState  # noqa: E402
+from dcc_jax.env.config import CONTROL_RATE  # noqa: E402
+from dcc_jax.env.environment import Environment  # noqa: E402
+from dcc_jax.env.state import EnvState  # noqa: E402
 from dcc_jax.learn import learner  # noqa: E402
 from dcc_jax.learn.update import chunk_size  # noqa: E402
 

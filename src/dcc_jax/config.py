@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from dcc_jax.env.environment import EnvConfig
+from dcc_jax.env.config import EnvConfig
 from dcc_jax.learn.discriminator import DiscriminatorConfig
 from dcc_jax.learn.ppo import PpoConfig
 from dcc_jax.learn.state import TrainConfig

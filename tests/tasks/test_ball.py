@@ -11,7 +11,8 @@ from scipy.integrate import solve_ivp
 
 from dcc_jax import physics, quat
 from dcc_jax.character import Character, asset_path, compose_scene
-from dcc_jax.env.environment import EnvConfig, Environment
+from dcc_jax.env.config import EnvConfig
+from dcc_jax.env.environment import Environment
 from dcc_jax.motion.clip import load_clip
 from dcc_jax.motion.reference import make_references
 from dcc_jax.tasks import ball

@@ -10,7 +10,8 @@ import pytest
 
 from dcc_jax import physics
 from dcc_jax.character import Character, asset_path, compose_scene
-from dcc_jax.env.environment import PHASE_SIZE, EnvConfig, Environment
+from dcc_jax.env.config import EnvConfig
+from dcc_jax.env.environment import PHASE_SIZE, Environment
 from dcc_jax.motion import author_door
 from dcc_jax.motion.clip import Clip, load_clip
 from dcc_jax.motion.reference import make_references

@@ -11,10 +11,8 @@ episode ends. It knows no task and no discriminator; both come from outside.
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass, field
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,136 +20,18 @@ import numpy as np
 from dcc_jax import physics, quat
 from dcc_jax.character import Character, compose_scene
 from dcc_jax.control import compliance, pd
-from dcc_jax.control.compliance import ComplianceConfig, Displacement
+from dcc_jax.control.compliance import Displacement
 from dcc_jax.env import features, metrics, pairs, rewards
-from dcc_jax.env.metrics import Metrics, Sums
-from dcc_jax.env.rewards import RewardConfig
+from dcc_jax.env.config import CONTROL_RATE, EnvConfig
+from dcc_jax.env.state import EnvState, Plan, Substep, contained
 from dcc_jax.env.task import Forces, RootTarget, Task
 from dcc_jax.motion.reference import References, RefState
 
 Array = jax.Array
 
-CONTROL_RATE = 30  # Hz, Sec. 5.1
 CROUCH_MARGIN = 0.1  # m, by which the pelvis may be lower than in the clips
 ALPHA_ENTRY = 270 + 36 + 4  # of the observation, where alpha is
 PHASE_SIZE = 3  # of the observation, where the reference is followed in time
-
-
-@dataclass(frozen=True)
-class EnvConfig:
-    """Physics, episodes, the level of compliance.
-
-    Raises:
-        ValueError: a value out of its range.
-    """
-
-    physics_rate: int = 240
-    """Physics steps a second, a multiple of 30; the paper has 600 (Sec. 5.1). 240 is
-    stable with the implicit PD (docs/performance.md)."""
-
-    newton_iterations: int = 8
-    """Of the contact solver, at most (docs/performance.md)."""
-
-    alpha: float = 0.16
-    """Level of compliance, in [0, 1] (Sec. 5.2 mostly uses 0.16)."""
-
-    alpha_max: float | None = None
-    """With it alpha is drawn from [alpha, alpha_max] in every episode and observed."""
-
-    episode_seconds: float = 10.0
-    """Episodes are truncated then, and where a clip that is followed in time ends."""
-
-    random_start: bool = True
-    """Episodes begin anywhere in a clip (Sec. 5.1); without, at its start."""
-
-    mass: float = 65.0
-    """Of the character, kg; gains scale with it (Sec. 5.1, 5.3)."""
-
-    displace_target: bool = True
-    """PD target a (+) u; without, a alone, as Sec. 4 can also be read."""
-
-    fall_height: float = 0.55
-    """m; with the pelvis lower than this above the ground, the character has fallen.
-    Where a clip goes lower, it may be lower by 0.1 m than any clip."""
-
-    limb_clearance: float = 0.10
-    """m; a body other than shins and feet whose origin comes so close to the ground has
-    touched it."""
-
-    clips: tuple[str, ...] = ()
-    """Files `*.npz` or names of the package's clips; empty: the task's own choice."""
-
-    compliance: ComplianceConfig = field(default_factory=ComplianceConfig)
-    reward: RewardConfig = field(default_factory=RewardConfig)
-
-    def __post_init__(self) -> None:
-        if self.physics_rate < 60 or self.physics_rate % CONTROL_RATE:
-            raise ValueError(
-                "env.physics_rate must be a multiple of 30, 60 or more, got "
-                f"{self.physics_rate}"
-            )
-        if not 0.0 <= self.alpha <= 1.0:
-            raise ValueError(f"env.alpha must be in [0, 1], got {self.alpha}")
-        if self.alpha_max is not None and not self.alpha <= self.alpha_max <= 1.0:
-            raise ValueError(
-                f"env.alpha_max must be in [alpha, 1], got {self.alpha_max}"
-            )
-        if not self.episode_seconds > 0.1:
-            raise ValueError(
-                f"env.episode_seconds must be more than 0.1, got {self.episode_seconds}"
-            )
-
-    @property
-    def control_steps(self) -> int:
-        """Physics steps of a control step."""
-        return self.physics_rate // CONTROL_RATE
-
-
-@flax.struct.dataclass
-class EnvState:
-    """Everything that ONE environment carries, and what the learner reads of it."""
-
-    obs: Array  # [O]
-    features: Array  # [270] s' of the discriminator
-    previous_features: Array  # [270] s
-    condition: Array  # [0]
-    r_q: Array  # [] where the clip is followed in time, else 0
-    r_p: Array  # []
-    r_task: Array  # []
-    terminated: Array  # [] bool
-    truncated: Array  # [] bool
-    nan: Array  # [] bool
-    metrics: Metrics
-    body: physics.State
-    displacement: Displacement  # of the character
-    u_previous: Array  # [55] one control step ago
-    q_previous: Array  # [55] the character's coordinates then
-    start: RootTarget  # of the reference, at the reset
-    reference: RefState  # now, where the clip is followed in time; else at the reset
-    alpha: Array  # []
-    time: Array  # [] s since the reset
-    task: Any
-
-
-@flax.struct.dataclass
-class Plan:
-    """What stays the same in the physics steps of one control step."""
-
-    action: Array  # [A]
-    pose: Array  # [55] that the policy asks for
-    alpha: Array  # []
-    reference: RefState  # at the end of the control step
-
-
-@flax.struct.dataclass
-class Substep:
-    """Carried through the physics steps of one control step."""
-
-    body: physics.State
-    displacement: Displacement
-    task: Any
-    time: Array
-    sums: Sums
 
 
 class Environment:
@@ -295,7 +175,7 @@ class Environment:
                 end.displacement.u,
             ),
         )
-        return _contained(self._judged(self.observed(new)), state)
+        return contained(self._judged(self.observed(new)), state)
 
     def expert_pairs(self, key: Array, n: int) -> tuple[Array, Array, Array]:
         """(s, s') ~ M: features [n, 270] twice, and the condition [n, 0]."""
@@ -585,16 +465,3 @@ def _seen_from(q: Array, vector: Array) -> Array:
     """A vector [2] on the ground in the local frame of the character's q [55]."""
     _, heading = features.local_frame(q)
     return quat.rotate(quat.inv(heading), jnp.append(vector, 0.0))[:2]
-
-
-def _contained(new: EnvState, old: EnvState) -> EnvState:
-    """`new`, or where a number of it is not finite, `old` as a terminated state."""
-    leaves = [x for x in jax.tree.leaves(new) if jnp.issubdtype(x.dtype, jnp.inexact)]
-    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in leaves]))
-    kept = jax.tree.map(lambda n, o: jnp.where(finite, n, o), new, old)
-    return dataclasses.replace(
-        kept,
-        terminated=kept.terminated | ~finite,
-        truncated=kept.truncated & finite,
-        nan=~finite,
-    )

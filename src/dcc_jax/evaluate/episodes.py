@@ -17,8 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
-from dcc_jax.env.environment import ALPHA_ENTRY, CONTROL_RATE, Environment, EnvState
+from dcc_jax.env.config import CONTROL_RATE
+from dcc_jax.env.environment import ALPHA_ENTRY, Environment
 from dcc_jax.env.mechanics import Mechanics
+from dcc_jax.env.state import EnvState
 from dcc_jax.evaluate import recording
 from dcc_jax.evaluate.recording import Frame, Recording
 from dcc_jax.evaluate.runs import Run

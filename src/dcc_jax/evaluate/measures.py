@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dcc_jax.env.environment import CONTROL_RATE
+from dcc_jax.env.config import CONTROL_RATE
 from dcc_jax.evaluate.recording import Recording
 
 DT = 1.0 / CONTROL_RATE

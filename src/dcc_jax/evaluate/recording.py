@@ -15,8 +15,9 @@ import numpy as np
 
 from dcc_jax import physics, quat
 from dcc_jax.env import mechanics
-from dcc_jax.env.environment import Environment, EnvState
+from dcc_jax.env.environment import Environment
 from dcc_jax.env.mechanics import Mechanics
+from dcc_jax.env.state import EnvState
 from dcc_jax.env.task import Forces
 
 Array = jax.Array

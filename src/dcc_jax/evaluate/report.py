@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dcc_jax.env.environment import CONTROL_RATE
+from dcc_jax.env.config import CONTROL_RATE
 from dcc_jax.env.task import Task
 from dcc_jax.evaluate import bootstrap, compare, measures
 from dcc_jax.evaluate.bootstrap import Interval

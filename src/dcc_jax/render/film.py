@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.image import imsave
 
 from dcc_jax import draw
-from dcc_jax.env.environment import CONTROL_RATE
+from dcc_jax.env.config import CONTROL_RATE
 from dcc_jax.env.task import Task
 from dcc_jax.evaluate.episodes import Player
 from dcc_jax.evaluate.recording import Motion, Recording, displaced

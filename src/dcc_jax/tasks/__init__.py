@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dcc_jax.character import asset_path, load_character
-from dcc_jax.env.environment import EnvConfig, Environment
+from dcc_jax.env.config import EnvConfig
+from dcc_jax.env.environment import Environment
 from dcc_jax.env.task import Task
 from dcc_jax.motion.clip import Clip, load_clip
 from dcc_jax.motion.reference import make_references

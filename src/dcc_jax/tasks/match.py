@@ -19,7 +19,8 @@ import mujoco
 
 from dcc_jax import physics, quat
 from dcc_jax.character import Character, add_contact, compose_scene, sole_names
-from dcc_jax.env.environment import Environment, EnvState, Plan, Substep
+from dcc_jax.env.environment import Environment
+from dcc_jax.env.state import EnvState, Plan, Substep
 from dcc_jax.motion.reference import CONTROL_DT, References, RefState, planar_moved
 from dcc_jax.tasks import partner
 from dcc_jax.tasks.chicken_fight import FRICTION, TARGETS, ChickenFight, State

@@ -1,0 +1,80 @@
+"""What a user can set about an environment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from dcc_jax.control.compliance import ComplianceConfig
+from dcc_jax.env.rewards import RewardConfig
+
+CONTROL_RATE = 30  # Hz, Sec. 5.1
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """Physics, episodes, the level of compliance.
+
+    Raises:
+        ValueError: a value out of its range.
+    """
+
+    physics_rate: int = 240
+    """Physics steps a second, a multiple of 30; the paper has 600 (Sec. 5.1). 240 is
+    stable with the implicit PD (docs/performance.md)."""
+
+    newton_iterations: int = 8
+    """Of the contact solver, at most (docs/performance.md)."""
+
+    alpha: float = 0.16
+    """Level of compliance, in [0, 1] (Sec. 5.2 mostly uses 0.16)."""
+
+    alpha_max: float | None = None
+    """With it alpha is drawn from [alpha, alpha_max] in every episode and observed."""
+
+    episode_seconds: float = 10.0
+    """Episodes are truncated then, and where a clip that is followed in time ends."""
+
+    random_start: bool = True
+    """Episodes begin anywhere in a clip (Sec. 5.1); without, at its start."""
+
+    mass: float = 65.0
+    """Of the character, kg; gains scale with it (Sec. 5.1, 5.3)."""
+
+    displace_target: bool = True
+    """PD target a (+) u; without, a alone, as Sec. 4 can also be read."""
+
+    fall_height: float = 0.55
+    """m; with the pelvis lower than this above the ground, the character has fallen.
+    Where a clip goes lower, it may be lower by 0.1 m than any clip."""
+
+    limb_clearance: float = 0.10
+    """m; a body other than shins and feet whose origin comes so close to the ground has
+    touched it."""
+
+    clips: tuple[str, ...] = ()
+    """Files `*.npz` or names of the package's clips; empty: the task's own choice."""
+
+    compliance: ComplianceConfig = field(default_factory=ComplianceConfig)
+    reward: RewardConfig = field(default_factory=RewardConfig)
+
+    def __post_init__(self) -> None:
+        if self.physics_rate < 60 or self.physics_rate % CONTROL_RATE:
+            raise ValueError(
+                "env.physics_rate must be a multiple of 30, 60 or more, got "
+                f"{self.physics_rate}"
+            )
+        if not 0.0 <= self.alpha <= 1.0:
+            raise ValueError(f"env.alpha must be in [0, 1], got {self.alpha}")
+        if self.alpha_max is not None and not self.alpha <= self.alpha_max <= 1.0:
+            raise ValueError(
+                f"env.alpha_max must be in [alpha, 1], got {self.alpha_max}"
+            )
+        if not self.episode_seconds > 0.1:
+            raise ValueError(
+                f"env.episode_seconds must be more than 0.1, got {self.episode_seconds}"
+            )
+
+    @property
+    def control_steps(self) -> int:
+        """Physics steps of a control step."""
+        return self.physics_rate // CONTROL_RATE
