@@ -22,6 +22,7 @@ LEVELS = {
     "command": 0,
     "curves": 0,  # reads what the logs wrote
     "character": 1,
+    "arrow": 1,
     "sparsity": 1,
     "solver": 1,
     "physics": 2,
