@@ -58,7 +58,7 @@ class Environment:
         )
         alone = compose_scene(character, floor=False)
         self.kinematics = features.Kinematics.of(alone)
-        self.nominal = _nominal_pose(references)
+        self.nominal = jax.jit(_nominal_pose)(references)
         self.return_stiffness = compliance.return_stiffness(
             config.compliance, character.nv
         )
@@ -153,7 +153,8 @@ class Environment:
         task, body = self.task.control_step(key, self.scene, state.task, state.body)
         reference = self._following(state.reference, task)
         pose = self._target_pose(reference, action)
-        start = Substep(body, state.displacement, task, state.time, metrics.no_sums())
+        sums = metrics.no_sums(state.alpha)
+        start = Substep(body, state.displacement, task, state.time, sums)
         return start, Plan(action, pose, state.alpha, reference)
 
     def end(self, state: EnvState, plan: Plan, end: Substep) -> EnvState:
@@ -437,9 +438,7 @@ def _nominal_pose(references: References) -> Array:
     Departure: the paper's action is q_bar itself. Around the mean pose the untrained
     policy stands about like the clips do, and the rotation vectors stay small.
     """
-    frames = (
-        np.arange(references.qpos.shape[1]) < np.asarray(references.frames)[:, None]
-    )
+    frames = jnp.arange(references.qpos.shape[1]) < references.frames[:, None]
     tangents = quat.log_map(references.coords, references.qpos)
     weight = frames[..., None] / frames.sum()
     mean = jnp.sum(weight * tangents, axis=(0, 1)).at[:6].set(0.0)

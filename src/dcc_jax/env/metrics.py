@@ -49,9 +49,13 @@ class Sums:
     power: Array  # [] W, sum over steps
 
 
-def no_sums() -> Sums:
-    """Before the first physics step."""
-    return Sums(*[jnp.zeros(()) for _ in Sums.__dataclass_fields__])
+def no_sums(like: Array) -> Sums:
+    """Before the first physics step, as many zeros as there are numbers `like`.
+
+    Under vmap a plain zero is not batched; what a loop makes of it is, and jax would
+    batch the whole loop twice to find that out.
+    """
+    return Sums(*[0.0 * like for _ in Sums.__dataclass_fields__])
 
 
 def add(sums: Sums, force: Array, torque: Array, speed: Array, h: float) -> Sums:
