@@ -121,10 +121,19 @@ def test_an_evaluation_hears_of_turns_and_flips(scene, go_on, standing):
     ("time", "left"), [(0.2, 1.0), (1.3, -0.1), (1.5, 100.0), (2.5, 100.0)]
 )
 def test_the_plate_kicks_at_the_push_off_of_the_clip(scene, reference, time, left):
-    state, _, _ = Backflip().reset(
+    state, _, _ = Backflip(kick_spread=0.0).reset(
         jax.random.key(1), scene, reference.state_at(0, time)
     )
     assert float(state.next_bounce) == pytest.approx(left, abs=1e-5)
+
+
+def test_the_kick_comes_a_little_early_or_late(scene, reference):
+    start = reference.state_at(0, 0.2)
+    keys = jax.random.split(jax.random.key(2), 64)
+    states, _, _ = jax.vmap(lambda key: Backflip().reset(key, scene, start))(keys)
+    off = np.asarray(states.next_bounce) - 1.0
+    assert np.abs(off).max() <= Backflip.kick_spread + 1e-6
+    assert off.min() < -0.02 and off.max() > 0.02
 
 
 def test_clips_are_files_or_names_of_the_packages_own():

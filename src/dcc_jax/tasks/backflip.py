@@ -29,6 +29,7 @@ class Backflip(Trampoline):
     name: ClassVar[str] = "backflip"
     clips: ClassVar[tuple[str, ...]] = ("backflip",)
     tracks: ClassVar[bool] = True
+    start_radius: ClassVar[float] = 0.05
 
     interval: float = 100.0
     """s; the plate kicks once."""
@@ -36,13 +37,17 @@ class Backflip(Trampoline):
     """N, upward on the plate, for `kick_time`."""
     kick_at: float = 1.2
     """s into the clip, when the legs begin to push."""
+    kick_spread: float = 0.03
+    """s by which it may come earlier or later; the policy sees it coming."""
 
     def reset(
         self, key: Array, scene: physics.Scene, reference: RefState
     ) -> tuple[State, Array, Array]:
         """The plate at rest; it kicks if the clip's push-off is still to come."""
-        state, qpos, qvel = super().reset(key, scene, reference)
-        to_come = self.kick_at - reference.time
+        plate_key, kick_key = jax.random.split(key)
+        state, qpos, qvel = super().reset(plate_key, scene, reference)
+        early = self.kick_spread * jax.random.uniform(kick_key, minval=-1.0)
+        to_come = self.kick_at - reference.time - early
         missed = to_come < -self.kick_time
         left = jnp.where(missed, self.interval, to_come)
         return dataclasses.replace(state, next_bounce=left), qpos, qvel
