@@ -19,7 +19,7 @@ PANELS = {
     "KL divergence of an update": ("ppo/kl",),
     "tuples per second": ("tuples_per_second",),
 }
-_POINTS = 200  # of a line: neighbouring updates are averaged
+_POINTS = 200  # of a line, at most: equally many neighbouring updates are averaged
 
 
 def draw(run_dirs: Sequence[Path], out: Path) -> None:
@@ -59,9 +59,10 @@ def _line(axes, rows: list[dict[str, float]], name: str, label: str) -> None:
     known = [row for row in rows if row.get(name) is not None]
     if not known:
         return
-    parts = np.array_split(np.arange(len(known)), min(_POINTS, len(known)))
-    tuples = [np.mean([known[i]["tuples"] for i in part]) / 1e6 for part in parts]
-    values = [np.mean([known[i][name] for i in part]) for part in parts]
+    size = -(-len(known) // _POINTS)
+    parts = [known[i : i + size] for i in range(0, len(known), size)]
+    tuples = [np.mean([row["tuples"] for row in part]) / 1e6 for part in parts]
+    values = [np.mean([row[name] for row in part]) for part in parts]
     axes.plot(tuples, values, label=label)
 
 
