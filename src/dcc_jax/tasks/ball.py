@@ -65,12 +65,13 @@ class Ball(Task):
     """m, of a basketball."""
     ball_mass: float = 0.6
     """kg, likewise."""
-    tilt: float = 0.05
+    tilt: float = 0.03
     """rad, the pole leans by up to this in x and in y at the reset."""
     interval: float = 2.0
     """s between two pushes."""
-    push: tuple[float, float] = (0.1, 0.3)
-    """m/s, what a push adds to the ball's velocity, in any horizontal direction."""
+    push: tuple[float, float] = (0.03, 0.1)
+    """m/s, what a push adds to the ball's velocity, in any horizontal direction. To
+    catch 0.3 m/s the head has to be 0.1 m further within 0.3 s, which takes a step."""
     dropped: float = 0.8
     """rad; with the pole leaning more than this the ball is lost."""
     head_force: float = 1000.0
