@@ -39,8 +39,7 @@ class State:
     next_bounce: Array  # [] s until the plate kicks; negative while it does
     airborne: Array  # [] s since a foot last touched the plate
     landed: Array  # [] s since the last landing
-    turned: Array  # [] rad, backwards, in this flight or the last one
-    flipping: Array  # [] bool, it has landed a flip and has to stand it yet
+    turned: Array  # [] rad, backwards, since it last stood
     flips: Array  # [] how many it has stood
 
 
@@ -109,7 +108,6 @@ class Trampoline(Task):
             airborne=jnp.zeros(()),
             landed=jnp.full((), self.absorb_time),
             turned=jnp.zeros(()),
-            flipping=jnp.zeros((), bool),
             flips=jnp.zeros(()),
         )
         return state, qpos, qvel
@@ -117,22 +115,20 @@ class Trampoline(Task):
     def control_step(
         self, key: Array, scene: physics.Scene, state: State, body: physics.State
     ) -> tuple[State, physics.State]:
-        """Counts down to the bounce, and the turns of a flight."""
+        """Counts down to the bounce, and the turns until it stands again.
+
+        Who stands has turned by whole turns, but for the lean of the take-off.
+        """
         over = state.next_bounce < -self.kick_time
         left = jnp.where(over, state.next_bounce + self.interval, state.next_bounce)
         pitch_rate = scene.character_qvel(body.qvel)[PITCH]
-        turned = jnp.where(
-            state.airborne > 0.0,
-            state.turned - CONTROL_DT * pitch_rate,
-            0.0,
-        )
-        stood = state.flipping & (state.landed >= self.absorb_time)
+        stands = (state.airborne == 0.0) & (state.landed >= self.absorb_time)
+        flipped = stands & (jnp.abs(state.turned) > FLIP)
         return dataclasses.replace(
             state,
             next_bounce=left - CONTROL_DT,
-            turned=turned,
-            flipping=state.flipping & ~stood,
-            flips=state.flips + stood,
+            turned=jnp.where(stands, 0.0, state.turned - CONTROL_DT * pitch_rate),
+            flips=state.flips + flipped,
         ), body
 
     def applied(
@@ -163,7 +159,6 @@ class Trampoline(Task):
             state,
             airborne=jnp.where(touching, 0.0, state.airborne + scene.timestep),
             landed=jnp.where(landing, 0.0, state.landed + scene.timestep),
-            flipping=state.flipping | (landing & (jnp.abs(state.turned) > FLIP)),
         )
         return state, Forces(
             force_w=force,
@@ -201,7 +196,7 @@ class Trampoline(Task):
         self, scene: physics.Scene, state: State, body: physics.State
     ) -> dict[str, Array]:
         """`since_bounce` s since the last kick began, `plate_height` m, `in_flight`,
-        `turned` rad backwards in the air, `flips` landed on the feet and stood."""
+        `turned` rad backwards since it last stood, `flips` that it landed and stood."""
         to_come = state.next_bounce > 0.0
         return {
             "since_bounce": jnp.where(to_come, self.interval, 0.0) - state.next_bounce,
