@@ -3,9 +3,11 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-# `make run`: about five minutes of learning on two cores.
+# `make run`: about five minutes of learning on two cores, at levels of compliance that
+# are learned in that time (0.16 takes half an hour).
 RUN := runs/trampoline-$(shell date +%Y%m%d-%H%M%S)
-TUPLES := 1228800
+TUPLES := 1638400
+LEVELS := --env.alpha 0 --env.alpha-max 0.04
 
 .PHONY: setup run test test-all check clean
 
@@ -18,10 +20,10 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $(STAMP)
 
 run: setup
-	$(BIN)/python -m dcc_jax.train --task trampoline --train.total-tuples $(TUPLES) --run-dir $(RUN)
+	$(BIN)/python -m dcc_jax.train --task trampoline $(LEVELS) --train.total-tuples $(TUPLES) --run-dir $(RUN)
 	$(BIN)/python -m dcc_jax.render $(RUN) --seconds 6 --out $(RUN)/policy.mp4
 	@echo "curves: $(RUN)/curves.png   video: $(RUN)/policy.mp4   go on: \
-	$(BIN)/python -m dcc_jax.train --task trampoline --resume --run-dir $(RUN)"
+	$(BIN)/python -m dcc_jax.train --task trampoline $(LEVELS) --resume --run-dir $(RUN)"
 
 test: setup
 	$(BIN)/python -m pytest -n auto --dist loadfile
