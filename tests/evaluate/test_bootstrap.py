@@ -47,6 +47,13 @@ def test_pair_with_one_half_missing_does_not_count():
     assert bootstrap.ratio(values, baseline, bootstrap.draws(3)).value == 2.0
 
 
+@pytest.mark.parametrize("n", [10, 127, 128, 256])
+def test_share_lies_in_its_interval_also_where_all_or_none_are_true(n):
+    for value in (0.0, 1.0):
+        share = bootstrap.share(np.full(n, value))
+        assert share.low <= share.value == value <= share.high
+
+
 def test_share_of_what_was_never_seen_is_not_certain():
     never = bootstrap.share(np.zeros(256))
     assert never.value == 0.0 and never.low == 0.0

@@ -42,7 +42,9 @@ def share(values: np.ndarray) -> Interval:
     p = float(np.mean(values))
     middle = (p + _Z**2 / (2 * n)) / (1 + _Z**2 / n)
     half = _Z / (1 + _Z**2 / n) * np.sqrt(p * (1 - p) / n + _Z**2 / (4 * n**2))
-    return Interval(p, max(0.0, float(middle - half)), min(1.0, float(middle + half)))
+    # Exact at 0 and 1, where rounding would put the share outside its interval.
+    low, high = max(0.0, float(middle - half)), min(1.0, float(middle + half))
+    return Interval(p, min(low, p), max(high, p))
 
 
 def ratio(values: np.ndarray, baseline: np.ndarray, resamples: np.ndarray) -> Interval:
