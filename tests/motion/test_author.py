@@ -219,6 +219,14 @@ def test_hop_uses_one_leg_and_goes_everywhere(motions):
     assert (eighth[1:] == eighth[:-1]).sum() > 10  # several in a row
 
 
+def test_hop_in_place_lands_where_it_left(motions):
+    motion = motions["hop_in_place"]
+    flights = [motion.state.com[part, :2] for part in motion.flights()]
+    assert len(flights) > 20
+    for path in flights:
+        np.testing.assert_allclose(path[-1], path[0], atol=0.01)
+
+
 def test_hand_stays_on_the_knob_of_a_closed_to_open_door(motions):
     motion = motions["door"]
     palm = motion.origins[:, RIGHT_HAND] + np.einsum(

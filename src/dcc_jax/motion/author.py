@@ -90,6 +90,7 @@ RECIPES: dict[str, Recipe] = {
     **_turning("run", author_run.run, 0.15),
     "run_cycle": Recipe(author_run.run_cycle, "run", loop=True),
     "hop": Recipe(author_hop.hop, "hop"),
+    "hop_in_place": Recipe(partial(author_hop.hop, length=0.0), "hop"),
     "door": Recipe(author_door.open_door, "door", phase=True),
 }
 """Every clip of ours; the recovery directions are degrees, 0 ahead, 90 left."""

@@ -36,10 +36,16 @@ def there_and_back() -> list[float]:
     return route
 
 
-def hop(duration: float = 17.0, side: int = 0) -> Solved:
-    """Hopping on one leg in all directions and back, the other leg drawn up."""
+def hop(duration: float = 17.0, side: int = 0, length: float = LENGTH) -> Solved:
+    """Hopping on one leg in all directions and back, the other leg drawn up.
+
+    Args:
+        duration: of the clip, s.
+        side: of the leg, 0 left and 1 right.
+        length: of a hop, m; with 0 it hops on the spot.
+    """
     t, begin = times(duration), 1.3
-    hopping = _hops(begin + 0.25, side)
+    hopping = _hops(begin + 0.25, side, length)
     lift, down = begin - 0.55, hopping[-1].land + CONTACT + 0.45
     other = home(1 - side)
     beside = {"x": hopping[-1].x, "y": hopping[-1].y - SIDES[side] * 0.16}
@@ -61,14 +67,14 @@ def hop(duration: float = 17.0, side: int = 0) -> Solved:
     return solve(replace(plan, tuck=np.tile(place, (len(t), 2, 1)), tucked=tucked))
 
 
-def _hops(leave: float, side: int) -> list[Foothold]:
+def _hops(leave: float, side: int, length: float) -> list[Foothold]:
     """Footholds of the hopping foot, the first of which it leaves at `leave` s."""
     start = home(side)
     spots = [replace(start, y=SIDES[side] * 0.05)]
     for direction in there_and_back():
         spots[-1] = replace(spots[-1], lift=leave, **OFF)
-        x = spots[-1].x + LENGTH * np.cos(direction)
-        y = spots[-1].y + LENGTH * np.sin(direction)
+        x = spots[-1].x + length * np.cos(direction)
+        y = spots[-1].y + length * np.sin(direction)
         spots.append(Foothold(x, y, 0.0, land=leave + AIR, **ON))
         leave += AIR + CONTACT
     return spots

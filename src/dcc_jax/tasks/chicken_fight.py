@@ -69,7 +69,7 @@ class ChickenFight(Task):
     """Hop, and take a bump without falling."""
 
     name: ClassVar[str] = "chicken-fight"
-    clips: ClassVar[tuple[str, ...]] = ("hop",)
+    clips: ClassVar[tuple[str, ...]] = ("hop_in_place",)
     tracks: ClassVar[bool] = True
     state_size: ClassVar[int] = 4
     clock: ClassVar[str | None] = "since_bump"
@@ -78,8 +78,8 @@ class ChickenFight(Task):
     """Of the character's names in the scene."""
     opponent: str = "box"
     """The opponent's root joint, or the first of a box's; it starts with x and y."""
-    gaits: Gaits = field(default_factory=lambda: Gaits(speeds=(0.0, 0.1, 0.2)))
-    """How the reference's root moves; the clips hop at 0.1 to 0.2 m/s."""
+    gaits: Gaits = field(default_factory=lambda: Gaits(speeds=(0.0, 0.05, 0.1)))
+    """How the reference's root moves: up to 5 cm a hop, with legs that hop in place."""
     interval: float = 3.0
     """s between two attacks."""
     speed: tuple[float, float] = (0.3, 1.0)
