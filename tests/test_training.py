@@ -81,7 +81,7 @@ def test_uninterrupted_run_leaves_everything_to_read(uninterrupted):
 def test_run_killed_at_random_and_resumed_is_the_same_run(uninterrupted, tmp_path):
     run_dir = tmp_path / "killed"
     rng = random.Random(0)
-    at = sorted(rng.sample(range(1, UPDATES - 5), 3))
+    at = sorted(rng.sample(range(1, UPDATES - 5), 5))
     for i, lines in enumerate(at):
         process = _start(run_dir, *["--resume"] * (i > 0))
         _wait_for(process, run_dir, lines)

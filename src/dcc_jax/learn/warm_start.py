@@ -23,7 +23,7 @@ from dcc_jax.learn.rollout import Environment
 
 Array = jax.Array
 
-SAMPLES = 1024  # of a step, over all devices
+SAMPLES = 256  # of a step, over all devices; 1024 lead to the same error
 LEARNING_RATE = 1e-3
 
 
