@@ -21,7 +21,7 @@ $(STAMP): pyproject.toml constraints.txt
 
 run: setup
 	$(BIN)/python -m dcc_jax.train --task trampoline $(LEVELS) --train.total-tuples $(TUPLES) --run-dir $(RUN)
-	$(BIN)/python -m dcc_jax.render $(RUN) --seconds 6 --out $(RUN)/policy.mp4
+	$(BIN)/python -m dcc_jax.render $(RUN) --seconds 12 --out $(RUN)/policy.mp4
 	@echo "curves: $(RUN)/curves.png   video: $(RUN)/policy.mp4   go on: \
 	$(BIN)/python -m dcc_jax.train --task trampoline $(LEVELS) --resume --run-dir $(RUN)"
 
