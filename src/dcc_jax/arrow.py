@@ -42,6 +42,14 @@ def row_order(shape: Arrow) -> np.ndarray:
     return np.concatenate([*limbs, shape.core_rows]).astype(int)
 
 
+def places(index: np.ndarray, size: int) -> np.ndarray:
+    """Where each of `size` numbers stands in an index; `size` itself is padding."""
+    real = index < size
+    where = np.empty(size, int)
+    where[index[real]] = np.flatnonzero(real)
+    return where
+
+
 def take(x: Array, index: np.ndarray) -> Array:
     """x[index] along the first axis, zero where the index is one past the end.
 
@@ -68,10 +76,7 @@ def joined(shape: Arrow, x: Split) -> Array:
     """The inverse of `split`, [nv, B]."""
     index = np.concatenate([*(s.dofs.ravel() for s in shape.stacks), shape.core])
     parts = [part.reshape(-1, *part.shape[2:]) for part in x.limbs]
-    real = index < shape.nv
-    back = np.empty(shape.nv, int)
-    back[index[real]] = np.flatnonzero(real)
-    return jnp.concatenate([*parts, x.core])[back]
+    return jnp.concatenate([*parts, x.core])[places(index, shape.nv)]
 
 
 def fronts(shape: Arrow, mass: Array) -> Fronts:

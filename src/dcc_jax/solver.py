@@ -14,9 +14,7 @@ batch as the LAST axis, so that a CPU's vector units work on many environments a
 and on the limbs of one size side by side (`sparsity`). Inside, every array is
 [..., B], and an unknown vector is an `arrow.Split`: the limbs' parts and the core's.
 
-Letters: R rows.
-Loops are rolled on purpose: XLA's CPU backend fuses unrolled recurrences into ever
-larger kernels, which compute the same numbers again and again (docs/performance.md).
+Letters: R rows. Loops are rolled on purpose (`arrow`).
 """
 
 from __future__ import annotations
@@ -171,10 +169,8 @@ def _newton(
     )
     _, _, qacc, residual, *_ = jax.lax.while_loop(unfinished, iterated, carry)
     force = -weights(residual) * residual
-    back = np.empty(shape.num_rows, int)
-    real = order < shape.num_rows
-    back[order[real]] = np.flatnonzero(real)
-    return arrow.joined(shape, qacc), force[back]
+    in_order = force[arrow.places(order, shape.num_rows)]
+    return arrow.joined(shape, qacc), in_order
 
 
 def _solve_mass(shape: Arrow, less: np.ndarray, mass: Array, forces: Array) -> Array:
