@@ -9,8 +9,9 @@ step is linearised about it, and the linear-quadratic regulator of that system t
 policy's place, in the task's own scene, at its rate, through the same joint targets.
 Printed: how fast the pose tips by itself, and the share of trials that still stand
 after five seconds, by the speed that the ball (`ball`) or the root (`chicken-fight`) is
-given at first, in all directions. Alpha is 0, and nothing else disturbs. What it holds
-can be held; what it does not, another feedback might.
+given at first, in all directions. Alpha is 0, and nothing else disturbs, but for the
+noise of `--noise` degrees on every joint target, which a policy has while it learns.
+What it holds can be held; what it does not, another feedback might.
 
 Letters: N states; a [36] joint targets, x = (position, velocity) [2 nv].
 """
@@ -19,6 +20,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 
 import numpy as np
 
@@ -135,15 +137,22 @@ def regulator(A: np.ndarray, B: np.ndarray, iterations: int = 3000) -> np.ndarra
     return gains
 
 
-def survivors(system: System, held, gains: np.ndarray, first: np.ndarray) -> float:
-    """Share of the trials, begun with velocities [N, nv], that do not fail."""
+def survivors(
+    system: System, held, gains: np.ndarray, first: np.ndarray, sigma: float
+) -> float:
+    """Share of the trials, begun with velocities [N, nv], that do not fail.
+
+    Joint targets have a standard deviation of sigma, rad.
+    """
     qpos, action = held
+    draw = np.random.default_rng(1)
     q, v = np.tile(qpos, (len(first), 1)), first
     stands = np.ones(len(first), bool)
     for _ in range(round(SECONDS * CONTROL_RATE)):
         pairs = zip(q, v, strict=True)
         x = np.stack([np.append(system.between(qpos, a), b) for a, b in pairs])
         targets = action - np.clip(x @ gains.T, -LIMIT, LIMIT)
+        targets += sigma * draw.standard_normal(targets.shape)
         q, v, failed = system.step(q, v, targets)
         stands &= ~failed & np.isfinite(v).all(axis=-1)
         q[~stands], v[~stands] = qpos, 0.0
@@ -170,6 +179,7 @@ def main() -> None:
     parser.add_argument("task", choices=EVENTS)
     parser.add_argument("--time", type=float, default=0.5, help="s into the clip")
     parser.add_argument("--speed", type=float, nargs="+", default=[0.05, 0.1, 0.2])
+    parser.add_argument("--noise", type=float, nargs="+", default=[0.0], help="degrees")
     options = parser.parse_args()
     wanted = config.make_config(options.task)
     env = dataclasses.replace(wanted.env, alpha=0.0)
@@ -184,9 +194,13 @@ def main() -> None:
     seconds = 1.0 / (CONTROL_RATE * np.log(growth))
     print(f"by itself it tips by a factor of e in {seconds:.2f} s")
     gains = regulator(A, B)
-    for speed in options.speed:
-        share = survivors(system, held, gains, pushes(environment, speed))
-        print(f"{speed:.2f} m/s: {share:.0%} of {TRIALS} stand for {SECONDS:g} s")
+    for noise, speed in itertools.product(options.noise, options.speed):
+        first = pushes(environment, speed)
+        share = survivors(system, held, gains, first, np.radians(noise))
+        print(
+            f"noise {noise:g} deg, {speed:.2f} m/s: "
+            f"{share:.0%} of {TRIALS} stand for {SECONDS:g} s"
+        )
 
 
 if __name__ == "__main__":
