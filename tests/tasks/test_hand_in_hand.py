@@ -210,6 +210,18 @@ def test_hand_velocity_is_the_rate_of_its_position(scene, reference):
         np.testing.assert_allclose(velocity, (ends[1] - ends[0]) / 4e-3, atol=0.02)
 
 
+def test_the_reference_holds_its_hand_where_the_partner_has_it():
+    references = _references()
+    keys = jax.random.split(jax.random.key(8), 64)
+    first = jax.vmap(lambda key: TASK.first_reference(key, references, False))(keys)
+    gap = jax.vmap(hand_in_hand.palm)(first.qpos) - jnp.array(hand_in_hand.NOMINAL_HAND)
+    np.testing.assert_allclose(np.mean(gap, axis=0), 0.0, atol=0.03)
+    assert np.linalg.norm(gap, axis=-1).max() < 0.13
+    stands = TASK.first_reference(jax.random.key(9), references, True)
+    palm = hand_in_hand.palm(stands.qpos)
+    np.testing.assert_allclose(palm, hand_in_hand.NOMINAL_HAND, atol=0.02)
+
+
 @pytest.mark.parametrize("elapsed", [CONTROL_DT, 0.1])
 def test_the_reference_runs_beside_the_partner(scene, elapsed):
     references = _references()
