@@ -7,6 +7,7 @@ import pytest
 
 from dcc_jax import config
 from dcc_jax.learn import learner
+from dcc_jax.tasks import TASKS
 
 
 @pytest.mark.parametrize("preset", config.PRESETS)
@@ -34,6 +35,20 @@ def test_paper_preset_has_the_papers_numbers():
     assert made.disc.minibatch_size == 16
     assert made.disc.learning_rate == 1e-4
     assert made.env.physics_rate == 600
+
+
+def test_settings_of_a_task_count_with_cpu_and_gpu_alone():
+    sigmas = {
+        p: config.make_config("ball", p).ppo.sigma_degrees for p in config.PRESETS
+    }
+    assert sigmas == {"smoke": 6.0, "cpu": 3.0, "gpu": 3.0, "paper": 6.0}
+    assert config.make_config("push").ppo.sigma_degrees == 6.0
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_settings_of_every_task_name_what_there_is(task):
+    made = config.make_config(task)
+    assert config.from_json(config.to_json(made)) == made
 
 
 def test_unknown_preset_is_named_with_the_allowed_ones():

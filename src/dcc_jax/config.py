@@ -15,6 +15,7 @@ from dcc_jax.env.config import EnvConfig
 from dcc_jax.learn.discriminator import DiscriminatorConfig
 from dcc_jax.learn.ppo import PpoConfig
 from dcc_jax.learn.state import TrainConfig
+from dcc_jax.tasks import TASKS
 
 Preset = Literal["smoke", "cpu", "gpu", "paper"]
 PRESETS: tuple[str, ...] = get_args(Preset)
@@ -51,6 +52,8 @@ class Config:
 def make_config(task: str, preset: str = "cpu") -> Config:
     """The configuration of a task; `dataclasses.replace` changes it.
 
+    With `cpu` and `gpu` the task's own `settings` count, where it has any.
+
     Args:
         task: its name.
         preset: `smoke`, `cpu`, `gpu` or `paper`.
@@ -59,7 +62,19 @@ def make_config(task: str, preset: str = "cpu") -> Config:
         ValueError: there is no such preset.
     """
     base = Config(task=task, preset=typing.cast(Preset, preset))
-    return _VARIANTS[preset](base)
+    made = _VARIANTS[preset](base)
+    own = TASKS[task].settings if task in TASKS and preset in ("cpu", "gpu") else {}
+    for name, value in own.items():
+        made = _replaced(made, name.split("."), value)
+    return made
+
+
+def _replaced(config: Any, path: list[str], value: Any) -> Any:
+    """A section with one entry changed, `path` the names that lead to it."""
+    name, *deeper = path
+    if deeper:
+        value = _replaced(getattr(config, name), deeper, value)
+    return dataclasses.replace(config, **{name: value})
 
 
 def _smoke(config: Config) -> Config:

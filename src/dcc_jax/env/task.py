@@ -8,6 +8,7 @@ Letters: F forces the compliance reacts to, S numbers of the task's own state ve
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -64,6 +65,9 @@ class Task:
     clock: ClassVar[str | None] = None
     """The entry of `evaluate`, in s since an event (a throw, a landing), over which an
     evaluation draws its curves; None: over the time since the reset."""
+    settings: ClassVar[Mapping[str, Any]] = {}
+    """What it learns with, by dotted name as on the command line, where the presets
+    `cpu` and `gpu` would say otherwise: `{"ppo.sigma_degrees": 3.0}`."""
     azimuth: ClassVar[float] = 130.0
     """Degrees, where pictures look: 90 is along +y, 180 along -x."""
 

@@ -96,9 +96,9 @@ class Agent:
     learning_rate: Array  # [] of the policy
 
 
-# The adaptive step size stays within these; Rudin (2021) goes up to 1e-2. Where the policy
-# hardly answers at first, as in a stand, it would grow until the first answer kills the
-# ReLUs: at 1e-3 a whole layer of them died and `ball` learned nothing more.
+# The adaptive step size stays within these; Rudin (2021) goes up to 1e-2. Where the
+# policy hardly answers at first, as in a stand, it would grow until the first answer
+# kills the ReLUs: at 1e-3 a whole layer died and `ball` learned nothing more.
 _MIN_LEARNING_RATE = 1e-6
 _MAX_LEARNING_RATE = 3e-4
 
