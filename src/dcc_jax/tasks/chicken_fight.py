@@ -78,8 +78,9 @@ class ChickenFight(Task):
         "ppo.sigma_degrees": 3.0,
         "env.fall_height": 0.65,
     }
-    """Noise of 6 degrees throws even a linear-quadratic regulator off one leg. Hops take
-    the pelvis down to 0.76 m; what is lower is a fall, of which less is seen then."""
+    """Noise of 6 degrees throws even a linear-quadratic regulator off one leg. Hops
+    take the pelvis down to 0.76 m: what is far below is a fall, of which less is seen
+    then."""
 
     prefix: str = ""
     """Of the character's names in the scene."""
