@@ -1,5 +1,6 @@
 """Pictures and videos."""
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -60,6 +61,14 @@ def test_the_camera_follows_the_body(model, fallback):
         model, np.stack([at(2.0)] * 2), camera=VIEW, size=SIZE, fallback=fallback
     )
     np.testing.assert_allclose(red(next(images)).mean(0), [50, 60], atol=4)
+
+
+def test_a_camera_that_does_not_lag_has_the_body_in_the_middle(model, fallback):
+    camera = dataclasses.replace(VIEW, smooth=0.0)
+    path = np.stack([at(x) for x in (0.0, 1.0, 3.0)])
+    images = draw.frames(model, path, camera=camera, size=SIZE, fallback=fallback)
+    for image in images:
+        np.testing.assert_allclose(red(image).mean(0), [50, 60], atol=4)
 
 
 def test_ghost_and_arrows_change_the_picture(model, fallback):

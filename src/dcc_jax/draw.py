@@ -40,7 +40,7 @@ class View:
     height: float = 0.85  # of the point looked at, above the ground
     body: str | None = "pelvis"  # whose ground position is followed; None: stand still
     target: tuple[float, float] = (0.0, 0.0)  # where to look when nothing is followed
-    smooth: float = 6.0  # frames, of the following
+    smooth: float = 6.0  # frames, of the following; 0: it keeps up
 
 
 def frames(
@@ -158,6 +158,8 @@ def _follow(model: mujoco.MjModel, qpos: np.ndarray, view: View) -> np.ndarray:
             data.qpos[:] = q
             mujoco.mj_kinematics(model, data)
             path[index, :2] = data.xpos[body, :2]
+    if view.smooth == 0.0:
+        return path
     return gaussian_filter1d(path, view.smooth, axis=0, mode="nearest")
 
 

@@ -70,6 +70,10 @@ class Task:
     `cpu` and `gpu` would say otherwise: `{"ppo.sigma_degrees": 3.0}`."""
     azimuth: ClassVar[float] = 130.0
     """Degrees, where pictures look: 90 is along +y, 180 along -x."""
+    camera_distance: ClassVar[float] = 3.4
+    """m, from how far."""
+    camera_height: ClassVar[float] = 0.85
+    """m above the ground, of the point they look at."""
 
     def extend(self, spec: mujoco.MjSpec) -> None:
         """Adds bodies and contact pairs to the scene of character and floor."""

@@ -5,6 +5,7 @@ Letters: T frames, one a control step.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -189,12 +190,20 @@ def _images(
     return draw.frames(
         environment.scene.model,
         motion.qpos,
-        camera=draw.View(azimuth=environment.task.azimuth),
+        camera=_view(environment.task, still=plan.out is None),
         ghost_qpos=displaced(environment, motion),
         arrows=_arrows(recording.motion, times, episodes),
         captions=_captions(plan, recording, times, episodes),
         mocap=(motion.mocap_pos, motion.mocap_quat),
     )
+
+
+def _view(task: Task, still: bool) -> draw.View:
+    """Where the camera is; it lags behind in a video, not on a page of pictures."""
+    view = draw.View(
+        azimuth=task.azimuth, distance=task.camera_distance, height=task.camera_height
+    )
+    return dataclasses.replace(view, smooth=0.0) if still else view
 
 
 def _arrows(

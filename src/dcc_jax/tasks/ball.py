@@ -63,6 +63,8 @@ class Ball(Task):
     """With 6 degrees of noise a linear-quadratic regulator loses the ball in 98 % of
     the trials, with 3 in none (`experiments/linear_feedback.py`). A stand shows nothing
     that a policy with small weights would not do."""
+    camera_distance: ClassVar[float] = 5.0  # the ball is at 2.9 m
+    camera_height: ClassVar[float] = 1.4
 
     pole_length: float = 1.0
     """m from the pivot to the middle of the ball; the paper gives none. A longer pole
