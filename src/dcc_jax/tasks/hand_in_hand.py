@@ -7,8 +7,8 @@ running by the partner's speed (`tasks.strides`), with the left arm held out to 
 partner instead of swung, and the character follows it in time.
 
 Departure: the paper learns to plan with the discriminator (Sec. 4.1) and leaves the
-planner to its Appendix. With a discriminator the characters of this task were still
-falling after two seconds when 0.6 M tuples had been seen (docs/results.md).
+planner to its Appendix. With a discriminator, and an arm that swung, the characters of
+this task were still falling after two seconds when 0.6 M tuples had been seen.
 """
 
 from __future__ import annotations
