@@ -8,12 +8,16 @@ are 95 % intervals. Beside the figure: FILE.csv, a row a bump, and FILE.json, wh
 drawn.
 
     python experiments/chicken_match.py HEAVY_RUN LIGHT_RUN [--alpha 0 0.16] [--video F]
+
+With `--mass 85 36` the two have these masses, whatever they were trained with: masses,
+inertias, gains, torque limits and the box all scale with the character's mass, so that
+a policy does at any mass what it does at its own (tests/tasks/test_chicken_fight.py).
 """
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,6 +46,12 @@ class Film:
     qvel: np.ndarray  # [T, N, nv]
     impulse: np.ndarray  # [T, N, 2, 3] N s, on each side
     fallen: np.ndarray  # [T, N, 2] bool
+
+
+def weighing(run: Run, mass: float) -> Run:
+    """The same policy in a character of another mass in kg."""
+    env = replace(run.config.env, mass=mass)
+    return replace(run, config=replace(run.config, env=env))
 
 
 def play(match: Match, runs: list[Run], level: float, count: int, steps: int, seed):
@@ -214,6 +224,7 @@ def main() -> None:
     add("light", type=Path, metavar="LIGHT_RUN")
     add("--alpha", type=float, nargs="+", default=[0.0, 0.16], metavar="A")
     add("--matches", type=int, default=64, help="of each level (64)")
+    add("--mass", type=float, nargs=2, metavar="KG", help="of the two (their own)")
     add("--seconds", type=float, default=20.0, help="of a match (20)")
     add("--distance", type=float, default=1.0, help="m between them at first (1.0)")
     add("--seed", type=int, default=0)
@@ -226,6 +237,8 @@ def main() -> None:
     from dcc_jax.tasks.match import Match
 
     runs = [find_run(path) for path in (options.heavy, options.light)]
+    if options.mass is not None:
+        runs = [weighing(run, kg) for run, kg in zip(runs, options.mass, strict=True)]
     heavy, light = (make_environment(run) for run in runs)
     match = Match(heavy, light, distance=options.distance)
     rows, points, film = [], [], None

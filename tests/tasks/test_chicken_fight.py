@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from dcc_jax import physics
+from dcc_jax import config, physics, tasks
 from dcc_jax.character import asset_path, compose_scene, load_character
 from dcc_jax.motion.clip import load_clip
 from dcc_jax.motion.reference import CONTROL_DT, make_references
@@ -251,3 +251,34 @@ def test_the_reference_hops_slowly_where_it_likes(scene, reference):
     assert np.ptp(np.array(heading)) > 4.0
     np.testing.assert_allclose(speed, 0.0)
     assert max(TASK.gaits.speeds) <= 0.1
+
+
+def test_a_character_moves_alike_at_any_mass():
+    """So that a policy trained at 65 kg plays at 36 and at 85 kg as well."""
+
+    def played(mass: float):
+        made = config.make_config("chicken-fight")
+        env = dataclasses.replace(made.env, mass=mass, alpha=0.16)
+        environment = tasks.make_environment(dataclasses.replace(made, env=env))
+
+        def step(state, at):
+            key, action = at
+            state = environment.step(key, state, action)
+            force = state.task.force_peak / environment.scene.character.mass
+            return state, (state.body.qpos, state.displacement.u, state.obs, force)
+
+        @jax.jit
+        def play(key):
+            reset_key, action_key, step_key = jax.random.split(key, 3)
+            state = environment.reset(reset_key)
+            soon = dataclasses.replace(state.task, next_attack=jnp.zeros(()))
+            state = dataclasses.replace(state, task=soon)
+            actions = 0.05 * jax.random.normal(action_key, (30, 36))
+            keys = jax.random.split(step_key, 30)
+            return jax.lax.scan(step, state, (keys, actions))[1]
+
+        return play(jax.random.key(3))
+
+    light, heavy = played(MASS), played(85.0)
+    assert np.max(light[-1]) > 1.0, "N/kg: the box has touched it"
+    chex.assert_trees_all_close(light, heavy, atol=5e-3, rtol=5e-3)
