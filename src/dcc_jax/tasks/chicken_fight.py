@@ -8,7 +8,7 @@ compliance. `tasks.match` lets two characters fight each other.
 
 Departure: the paper trains with the discriminator. Hops have little in common with what
 a falling body does, and 0.66 M tuples took episodes from 0.8 to 1.3 s only; the clip's
-time is known here (Appendix). That is not learned yet either (docs/results.md).
+time is known here (Appendix).
 """
 
 from __future__ import annotations
