@@ -104,6 +104,18 @@ def test_they_stand_face_to_face_and_see_each_other(match, aloft):
     np.testing.assert_allclose(x, [-0.35, 0.35], atol=1e-6)
 
 
+def test_no_two_matches_begin_alike(match):
+    """Also where episodes begin at the start of a clip, as evaluations have it."""
+    side = match.sides[0]
+    moments = [
+        float(side.task.first_reference(key, side.references, True).time)
+        for key in jax.random.split(jax.random.key(4), 4)
+    ]
+    assert len(set(moments)) == 4
+    duration = float(side.references.duration[0])
+    assert min(moments) >= 0.0 and max(moments) <= 0.3 * duration
+
+
 def test_impulses_are_opposite_and_are_what_each_gains(match, aloft):
     _, before, after = aloft
     given = [side.task.impulse.sum(axis=0) for side in after]

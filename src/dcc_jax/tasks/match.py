@@ -43,8 +43,8 @@ class Fighter(ChickenFight):
     def first_reference(
         self, key: Array, references: References, begin: bool
     ) -> RefState:
-        """Early in the clip, so that it lasts."""
-        at = super().first_reference(key, references, begin)
+        """Early in the clip, so that it lasts, and never twice the same."""
+        at = super().first_reference(key, references, begin=False)
         return references.state_at(at.clip, EARLY * at.time)
 
     def aimed(self, scene: physics.Scene, state: State, body: physics.State) -> State:
