@@ -157,16 +157,24 @@ def measured(level: float, results: np.ndarray, rows: list[dict]) -> list[dict]:
         for i, name in enumerate((*NAMES, "nobody"))
     ]
     if rows:
-        draws = bootstrap.draws(len(rows))
+        # Bumps of a match are alike: whole matches are resampled, and a mean over
+        # bumps is the ratio of their sums and their numbers.
+        draws = bootstrap.draws(len(results))
         value = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-        heavy, light = (value[f"driven_{name}"] for name in NAMES)
         lost = value["momentum_after"] - value["momentum_before"]
+
+        def total(values: np.ndarray) -> np.ndarray:
+            return np.bincount(value["match"], values, minlength=len(results))
+
+        count, impulse = total(np.ones(len(rows))), total(value["impulse"])
+        heavy, light = total(-value["driven_heavy"]), total(value["driven_light"])
         named += [
-            ("driven_heavy", bootstrap.mean(-heavy, draws)),
-            ("driven_light", bootstrap.mean(light, draws)),
-            ("driven_light_to_heavy", bootstrap.ratio(light, -heavy, draws)),
-            ("impulse", bootstrap.mean(value["impulse"], draws)),
-            ("momentum_change", bootstrap.mean(lost, draws)),
+            ("bumps", bootstrap.mean(count, draws)),
+            ("driven_heavy", bootstrap.ratio(heavy, count, draws)),
+            ("driven_light", bootstrap.ratio(light, count, draws)),
+            ("driven_light_to_heavy", bootstrap.ratio(light, heavy, draws)),
+            ("impulse", bootstrap.ratio(impulse, count, draws)),
+            ("momentum_change", bootstrap.ratio(total(lost), count, draws)),
         ]
     return [{"alpha": level, "name": name, **asdict(x)} for name, x in named]
 

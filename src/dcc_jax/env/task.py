@@ -68,7 +68,7 @@ class Task:
     settings: ClassVar[Mapping[str, Any]] = {}
     """What it learns with, by dotted name as on the command line, where the presets
     `cpu` and `gpu` would say otherwise: `{"ppo.sigma_degrees": 3.0}`."""
-    azimuth: ClassVar[float] = 130.0
+    camera_azimuth: ClassVar[float] = 130.0
     """Degrees, where pictures look: 90 is along +y, 180 along -x."""
     camera_distance: ClassVar[float] = 3.4
     """m, from how far."""

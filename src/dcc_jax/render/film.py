@@ -201,7 +201,9 @@ def _images(
 def _view(task: Task, still: bool) -> draw.View:
     """Where the camera is; it lags behind in a video, not on a page of pictures."""
     view = draw.View(
-        azimuth=task.azimuth, distance=task.camera_distance, height=task.camera_height
+        azimuth=task.camera_azimuth,
+        distance=task.camera_distance,
+        height=task.camera_height,
     )
     return dataclasses.replace(view, smooth=0.0) if still else view
 

@@ -83,9 +83,8 @@ class Ball(Task):
     """m/s, what a push adds to the ball's velocity, in any horizontal direction. To
     catch 0.3 m/s the head has to be 0.1 m further within 0.3 s, which takes a step."""
     dropped: float = 0.3
-    """rad; with the pole leaning more than this the ball is lost, as nothing within the
-    character's reach brings it back. At 0.8 rad a quarter of all that is seen at first
-    are falls, and the leans that matter vanish in the spread of the observation."""
+    """rad; with the pole leaning more than this the ball is lost: standing, nobody
+    brings it back. At 0.8 rad a quarter of all that is seen at first are such falls."""
     head_force: float = 1000.0
     """N of fictional force at the head for an action of 1; 0 takes it away. At alpha =
     0.16 it takes the head of the standing character 0.13 m/s sideways or ahead."""

@@ -67,7 +67,7 @@ class Door(Task):
     tracks: ClassVar[bool] = True
     start_radius: ClassVar[float] = 0.02
     state_size: ClassVar[int] = 7
-    azimuth: ClassVar[float] = 20.0  # the door hides what is behind it
+    camera_azimuth: ClassVar[float] = 20.0  # the door hides what is behind it
 
     width: float = 1.0
     """m from hinge to knob; 1.0 in training, up to 1.7 in evaluation (Sec. 5.4)."""

@@ -40,8 +40,8 @@ ZERO_PALM = (0.0, 0.775, 1.335)  # m, where it is in the character's zero pose
 NOMINAL_HAND = (0.2, 0.42, 0.84)  # m ahead, left of the reference's root, and up
 ARM = {"left_shoulder": (-0.97, 0.24, -0.12), "left_elbow": (0.0, 0.0, -0.73)}
 """Rotation vectors, rad, that hold the left palm at NOMINAL_HAND: within 1 cm in a
-stand, 3 cm in a run in the mean, with 4 cm of rocking. An arm that asked for its swing
-would pull at the partner with 200 N in every stand."""
+stand, 4 cm in a jog or a run in the mean, with 4 cm of rocking. Arms that swung had the
+hands pull with 175 N in every stand."""
 SETTLING_TIME = 0.2  # s, in which the joined hands leave the reference's palm
 CADENCE = 2.0 * np.pi * 2.7  # rad/s, of the steps that rock the partner's hand
 RUN = 3.0  # m/s, at which they rock it in full
@@ -115,14 +115,16 @@ class HandInHand(Task):
         if begin:
             speed = 0.0 * speed
         loops = strides.strides(references)
-        return _reaching(strides.begin(references, loops, phase, speed, CONTROL_DT))
+        begins = strides.begin(references, loops, phase, speed, CONTROL_DT)
+        return _reaching(references.coords, begins)
 
     def reference(
         self, references: References, state: State, at: RefState, elapsed: float
     ) -> RefState:
         """Beside the partner, as it goes."""
         loops = strides.strides(references)
-        return _reaching(strides.go_on(references, loops, state.motion, at, elapsed))
+        later = strides.go_on(references, loops, state.motion, at, elapsed)
+        return _reaching(references.coords, later)
 
     def reset(
         self, key: Array, scene: physics.Scene, reference: RefState
@@ -246,18 +248,23 @@ def palm(q: Array) -> Array:
     return positions[hand] + quat.rotate(quats[hand], jnp.array(PALM))
 
 
-def _reaching(reference: RefState) -> RefState:
+def _reaching(coords: quat.Coordinates, reference: RefState) -> RefState:
     """The same moment with the left arm held out to the partner."""
     names = load_character().joint_names
-    qpos, qvel, before = reference.qpos, reference.qvel, reference.qpos_previous
-    for name, turn in ARM.items():
-        joint = names.index(name)
-        q_adr, v_adr = 7 + 4 * joint, 6 + 3 * joint
-        held = quat.exp(jnp.array(turn))
-        qpos = qpos.at[q_adr : q_adr + 4].set(held)
-        before = before.at[q_adr : q_adr + 4].set(held)
-        qvel = qvel.at[v_adr : v_adr + 3].set(0.0)
-    return dataclasses.replace(reference, qpos=qpos, qvel=qvel, qpos_previous=before)
+    arm = np.array([1 + names.index(name) for name in ARM])  # after the root
+
+    def held(q: Array) -> Array:
+        scalars, quats = coords.split_q(q)
+        pose = quat.exp(jnp.array(list(ARM.values())))
+        return coords.join_q(scalars, quats.at[arm].set(pose))
+
+    scalars, turning = coords.split_v(reference.qvel)
+    return dataclasses.replace(
+        reference,
+        qpos=held(reference.qpos),
+        qvel=coords.join_v(scalars, turning.at[arm].set(0.0)),
+        qpos_previous=held(reference.qpos_previous),
+    )
 
 
 @cache
