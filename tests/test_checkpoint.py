@@ -124,12 +124,12 @@ def test_full_disk_leaves_the_earlier_checkpoints_intact(run_dir):
 
 def test_another_network_size_is_refused_by_name(run_dir):
     other = _state(0).replace(layers=networks.init_mlp(jax.random.key(0), (40, 50, 3)))
-    with pytest.raises(ValueError, match=r"layers\.0\.(bias|kernel) has shape"):
+    with pytest.raises(ValueError, match=r"layers\.layers\.0\.(bias|kernel) has shape"):
         checkpoint.restore_latest(run_dir, other, _silent)
     deeper = _state(0).replace(
         layers=networks.init_mlp(jax.random.key(0), (40, 60, 60, 3))
     )
-    with pytest.raises(ValueError, match=r"does not fit this run: layers\.2"):
+    with pytest.raises(ValueError, match=r"does not fit this run: layers\.layers\.2"):
         checkpoint.restore_latest(run_dir, deeper, _silent)
 
 

@@ -152,5 +152,5 @@ def test_environment_that_breaks_is_counted_and_dumped(tmp_path):
     dumps = sorted((tmp_path / "run" / "nan").iterdir())
     with np.load(dumps[0], allow_pickle=False) as dump:
         assert dump["env.obs"].shape == (3,) and dump["action"].shape == (2,)
-    kernel = result.params.params[0].kernel
+    kernel = result.params.params.layers[0].kernel
     assert np.isfinite(kernel).all()

@@ -14,14 +14,14 @@ import shutil
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-from dcc_jax.learn.networks import Layer
+from dcc_jax.learn.networks import ACTIVATIONS, Activation, Layer, Mlp
 from dcc_jax.learn.normalizer import Normalizer
 from dcc_jax.learn.rollout import Policy
 
@@ -130,7 +130,8 @@ def save_policy(directory: Path, policy: Policy) -> Path:
     """Writes `policy.npz`, a few hundred kB, replacing an older one atomically."""
     path = directory / "policy.npz"
     partial = directory / "policy.partial.npz"
-    np.savez(partial, **to_arrays(policy))  # pyright: ignore[reportArgumentType]
+    arrays = to_arrays(policy) | {"activation": np.array(policy.params.activation)}
+    np.savez(partial, **arrays)  # pyright: ignore[reportArgumentType]
     os.replace(partial, path)
     return path
 
@@ -150,14 +151,15 @@ def load_policy(directory: Path) -> Policy:
             field: arrays[f"normalizer.{field}"]
             for field in Normalizer.__dataclass_fields__
         }
+        layers = tuple(
+            Layer(
+                kernel=arrays[f"params.layers.{i}.kernel"],
+                bias=arrays[f"params.layers.{i}.bias"],
+            )
+            for i in range(count)
+        )
         return Policy(
-            params=tuple(
-                Layer(
-                    kernel=arrays[f"params.{i}.kernel"],
-                    bias=arrays[f"params.{i}.bias"],
-                )
-                for i in range(count)
-            ),
+            params=Mlp(layers=layers, activation=_activation(arrays)),
             normalizer=Normalizer(**normalizer),
         )
     except FileNotFoundError:
@@ -174,6 +176,13 @@ def write_atomically(path: Path, content: bytes) -> None:
         file.flush()
         os.fsync(file.fileno())
     os.replace(partial, path)
+
+
+def _activation(arrays: dict[str, np.ndarray]) -> Activation:
+    name = str(arrays["activation"])
+    if name not in ACTIVATIONS:
+        raise ValueError(f"unknown activation {name!r}")
+    return cast(Activation, name)
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:

@@ -13,7 +13,7 @@ CONFIG = DiscriminatorConfig(gradient_penalty=3.0, logit_penalty=0.5)
 
 def _linear() -> networks.Mlp:
     """D(x) = 3 x_0 + 4 x_1 + 1."""
-    return (networks.Layer(jnp.array([[3.0], [4.0]]), jnp.array([1.0])),)
+    return networks.Mlp((networks.Layer(jnp.array([[3.0], [4.0]]), jnp.array([1.0])),))
 
 
 def test_loss_of_a_linear_discriminator():
@@ -35,7 +35,7 @@ def test_gradient_penalty_is_the_mean_squared_slope():
         networks.Layer(jnp.array([[1.0], [2.0]]), jnp.zeros(1)),
     )
     x = jnp.array([[1.0], [2.0], [-1.0]])
-    penalty = discriminator.gradient_penalty(layers, x)
+    penalty = discriminator.gradient_penalty(networks.Mlp(layers), x)
     np.testing.assert_allclose(penalty, (1 + 1 + 4) / 3)
 
 

@@ -47,7 +47,7 @@ def test_update_is_traced_once(compiled, first_state):
 
 def test_donated_state_is_gone(compiled, first_state):
     compiled.update(first_state)
-    assert first_state.agent.policy.params[0].kernel.is_deleted()
+    assert first_state.agent.policy.params.layers[0].kernel.is_deleted()
 
 
 def test_parameters_are_the_same_on_every_device(compiled, first_state):

@@ -62,7 +62,7 @@ def test_log_prob_is_that_of_scipy():
 
 def _constant(value: float) -> networks.Mlp:
     """A network whose output is `value` whatever it sees."""
-    return (networks.Layer(jnp.zeros((1, 1)), jnp.array([value])),)
+    return networks.Mlp((networks.Layer(jnp.zeros((1, 1)), jnp.array([value])),))
 
 
 def _batch(config: ppo.PpoConfig, advantage: float, ratio: float) -> ppo.Batch:
@@ -116,7 +116,13 @@ def test_first_policy_hardly_offsets_the_pose():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("clip", 0.0), ("discount", 1.5), ("epochs", 0), ("hidden", (0,))],
+    [
+        ("clip", 0.0),
+        ("discount", 1.5),
+        ("epochs", 0),
+        ("hidden", (0,)),
+        ("activation", "sine"),
+    ],
 )
 def test_value_out_of_range_is_named(name, value):
     with pytest.raises(ValueError, match=rf"ppo\.{name} must be .*, got"):

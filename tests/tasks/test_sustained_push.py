@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -10,9 +12,9 @@ import pytest
 
 from dcc_jax import physics
 from dcc_jax.character import asset_path, load_character
-from dcc_jax.env.task import RootTarget
 from dcc_jax.motion.clip import load_clip
-from dcc_jax.motion.reference import CONTROL_DT, make_references
+from dcc_jax.motion.reference import CONTROL_DT, make_references, planar_moved
+from dcc_jax.tasks import partner
 from dcc_jax.tasks.sustained_push import State, SustainedPush
 
 TASK = SustainedPush()
@@ -28,8 +30,8 @@ def references():
 @pytest.fixture(scope="module")
 def schedules(scene, references):
     """States of PUSHED characters after each of STEPS control steps, [T, B]."""
-    reset_key, run_key = jax.random.split(jax.random.key(0))
-    standing = references.state_at(0, 0.0)
+    stand_key, reset_key, run_key = jax.random.split(jax.random.key(0), 3)
+    standing = TASK.first_reference(stand_key, references, True)
     begin = jax.vmap(lambda key: TASK.reset(key, scene, standing)[0])
     go_on = jax.vmap(lambda key, state: TASK.control_step(key, scene, state, None)[0])
 
@@ -107,7 +109,7 @@ def test_a_push_accelerates_the_character_by_force_over_mass(
     @jax.vmap
     def pushed(state, target):
         kin = physics.kinematics(scene, state)
-        push = State(force, target, jnp.ones(()), jnp.ones(()))
+        push = State(None, force, target, jnp.ones(()), jnp.ones(()))
         return TASK.applied(scene, push, kin, jnp.zeros(())), TASK._place(
             scene, push, kin
         )
@@ -128,14 +130,73 @@ def test_a_push_accelerates_the_character_by_force_over_mass(
     assert character.mass == load_character().mass
 
 
-def test_reference_of_a_walk_and_a_run_goes_on_and_of_a_stand_stays(scene, references):
-    for clip, name in enumerate(TASK.clips):
-        speed = {"walk_cycle": 1.2, "jog_cycle": 2.0, "run_cycle": 3.0}.get(name, 0.0)
-        start = references.state_at(clip, 0.2)
-        target = TASK.root_target(
-            scene, None, RootTarget(start.qpos[:2], start.travel), jnp.array(4.0)
+def test_path_stops_and_runs_and_the_reference_keeps_to_it(scene, references):
+    first = TASK.first_reference(jax.random.key(1), references, False)
+    state, *_ = TASK.reset(jax.random.key(2), scene, first)
+
+    @jax.jit
+    def step(key, state, reference):
+        state, _ = TASK.control_step(key, scene, state, None)
+        return state, TASK.reference(references, state, reference, CONTROL_DT)
+
+    speeds, reference = [], first
+    for key in jax.random.split(jax.random.key(3), STEPS):
+        state, reference = step(key, state, reference)
+        root, heading, speed = partner.path(
+            state.motion, state.motion.time + CONTROL_DT
         )
-        assert np.linalg.norm(target.velocity) == pytest.approx(speed, abs=0.05)
-        assert np.linalg.norm(target.position - start.qpos[:2]) == pytest.approx(
-            4.0 * speed, abs=0.2
+        np.testing.assert_allclose(reference.qpos[:2], root, atol=1e-4)
+        np.testing.assert_allclose(
+            reference.qvel[:2], speed * partner.direction(heading), atol=1e-4
         )
+        speeds.append(float(speed))
+    assert min(speeds) < 0.01 and max(speeds) > 2.9
+
+
+def test_path_is_seen_in_the_characters_frame(scene, references):
+    first = TASK.first_reference(jax.random.key(0), references, True)
+    state, qpos, qvel = TASK.reset(jax.random.key(0), scene, first)
+    motion = dataclasses.replace(
+        state.motion,
+        time=jnp.zeros(()),
+        position=first.qpos[:2] + jnp.array([0.3, 0.1]),
+        heading=jnp.zeros(()),
+        speed=jnp.array(1.5),
+        acceleration=jnp.zeros(()),
+        turn=jnp.zeros(()),
+    )
+    state = dataclasses.replace(state, motion=motion)
+    body = physics.initial_state(scene, qpos, qvel)
+    along = 1.5 * CONTROL_DT
+    expected = [0.3 + along, 0.1, 1.5, 0.0, 1.0, 0.0]
+    turn = 2.0 * np.pi / 3.0
+    for angle in (0.0, turn):
+        # The character turns, what it sees turns the other way.
+        q = planar_moved(first.qpos, jnp.array(angle), jnp.zeros(2))
+        q = q.at[:2].set(first.qpos[:2])
+        turned = dataclasses.replace(body, qpos=body.qpos.at[:55].set(q))
+        seen = TASK.observe(scene, state, turned).reshape(3, 2)
+        back = seen @ np.array(
+            [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
+        )
+        facing = _facing(first.qpos)
+        spun = np.array(expected).reshape(3, 2) @ np.array(
+            [[np.cos(facing), -np.sin(facing)], [np.sin(facing), np.cos(facing)]]
+        )
+        np.testing.assert_allclose(back, spun, atol=1e-4)
+
+
+@pytest.mark.parametrize(("away", "ends"), [(1.1, False), (1.3, True)])
+def test_episode_ends_where_the_path_is_left(scene, references, away, ends):
+    first = TASK.first_reference(jax.random.key(0), references, True)
+    state, qpos, qvel = TASK.reset(jax.random.key(0), scene, first)
+    body = physics.initial_state(scene, qpos.at[0].add(away), qvel)
+    assert TASK.evaluate(scene, state, body)["path_distance"] == pytest.approx(
+        away, abs=1e-3
+    )
+    assert bool(TASK.terminated(scene, state, body)) is ends
+
+
+def _facing(qpos) -> float:
+    w, x, y, z = np.asarray(qpos[3:7])
+    return float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))

@@ -84,7 +84,7 @@ def make_environment(run: Run, task: Task | None = None) -> Environment:
     except FileNotFoundError as error:
         raise ValueError(f"{error}") from None
     sizes = environment.observation_size, environment.action_size
-    layers = run.policy.params
+    layers = run.policy.params.layers
     has = layers[0].kernel.shape[0], layers[-1].kernel.shape[1]
     if has != sizes:
         raise ValueError(

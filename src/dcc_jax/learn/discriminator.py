@@ -107,7 +107,7 @@ def loss(
     d_expert, d_policy = jnp.split(d, [expert.shape[0]])
     least_squares = jnp.mean((d_expert - 1.0) ** 2) + jnp.mean((d_policy + 1.0) ** 2)
     penalty = gradient_penalty(params, expert)
-    logit = jnp.sum(params[-1].kernel ** 2)
+    logit = jnp.sum(params.layers[-1].kernel ** 2)
     total = (
         least_squares
         + 0.5 * config.gradient_penalty * penalty

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Literal, get_args
 
 import flax.struct
 import jax
@@ -18,6 +19,9 @@ from jax.flatten_util import ravel_pytree
 
 Array = jax.Array
 
+Activation = Literal["relu", "leaky_relu", "elu", "silu", "tanh"]
+ACTIVATIONS: tuple[str, ...] = get_args(Activation)
+
 
 @flax.struct.dataclass
 class Layer:
@@ -27,7 +31,12 @@ class Layer:
     bias: Array  # [O]
 
 
-Mlp = tuple[Layer, ...]
+@flax.struct.dataclass
+class Mlp:
+    """Affine maps with a nonlinearity between them."""
+
+    layers: tuple[Layer, ...]
+    activation: Activation = flax.struct.field(pytree_node=False, default="relu")
 
 
 @flax.struct.dataclass
@@ -38,33 +47,42 @@ class Network:
     opt_state: optax.OptState  # of all parameters as one vector
 
 
-def init_mlp(key: Array, sizes: Sequence[int], output_gain: float = 1.0) -> Mlp:
+def init_mlp(
+    key: Array,
+    sizes: Sequence[int],
+    output_gain: float = 1.0,
+    activation: Activation = "relu",
+) -> Mlp:
     """Draws the layers of a network, Xavier uniform (Sec. 5.1), biases zero.
 
     Args:
         key: consumed.
         sizes: inputs, hidden widths, outputs.
         output_gain: factor on the kernel of the last layer.
+        activation: between the layers.
     """
     shapes = list(itertools.pairwise(sizes))
     # One draw for all layers: every random operation costs compile time.
     ends = np.cumsum([n_in * n_out for n_in, n_out in shapes])
     parts = jnp.split(jax.random.uniform(key, (int(ends[-1]),), minval=-1.0), ends[:-1])
     gains = [1.0] * (len(shapes) - 1) + [output_gain]
-    return tuple(
+    layers = tuple(
         Layer(
             kernel=part.reshape(shape) * (gain * math.sqrt(6.0 / sum(shape))),
             bias=jnp.zeros(shape[1]),
         )
         for part, shape, gain in zip(parts, shapes, gains, strict=True)
     )
+    return Mlp(layers=layers, activation=activation)
 
 
-def apply_mlp(layers: Mlp, x: Array) -> Array:
-    """Output [..., O] of a ReLU network for x [..., I]."""
-    for layer in layers[:-1]:
-        x = jax.nn.relu(x @ layer.kernel + layer.bias)
-    return x @ layers[-1].kernel + layers[-1].bias
+def apply_mlp(network: Mlp, x: Array) -> Array:
+    """Output [..., O] of a network for x [..., I]."""
+    activate: Callable[[Array], Array] = getattr(jax.nn, network.activation)
+    *hidden, last = network.layers
+    for layer in hidden:
+        x = activate(x @ layer.kernel + layer.bias)
+    return x @ last.kernel + last.bias
 
 
 def clipped_adam(max_gradient_norm: float) -> optax.GradientTransformation:

@@ -24,6 +24,10 @@ class PpoConfig:
     hidden: tuple[int, ...] = (256, 256, 256)
     """Widths of the hidden layers of both networks (Sec. 5.1)."""
 
+    activation: networks.Activation = "relu"
+    """Between the layers of both networks; the paper does not say. ReLUs may die, but
+    ELUs learned `hand-in-hand` more slowly (docs/results.md)."""
+
     sigma_degrees: float = 6.0
     """Standard deviation of every action (Sec. 5.1)."""
 
@@ -69,6 +73,9 @@ class PpoConfig:
         _require(kl is None or kl > 0, "target_kl", kl, "positive or None")
         widths = all(width > 0 for width in self.hidden)
         _require(widths, "hidden", self.hidden, "positive widths")
+        known = self.activation in networks.ACTIVATIONS
+        allowed = f"one of {', '.join(networks.ACTIVATIONS)}"
+        _require(known, "activation", self.activation, allowed)
 
     @property
     def sigma(self) -> float:
@@ -114,9 +121,16 @@ def init_agent(
     policy_key, value_key = jax.random.split(key)
     optimizer = networks.clipped_adam(config.max_gradient_norm)
     policy = networks.init_mlp(
-        policy_key, (observation_size, *config.hidden, action_size), 0.01
+        policy_key,
+        (observation_size, *config.hidden, action_size),
+        output_gain=0.01,
+        activation=config.activation,
     )
-    value = networks.init_mlp(value_key, (observation_size, *config.hidden, 1))
+    value = networks.init_mlp(
+        value_key,
+        (observation_size, *config.hidden, 1),
+        activation=config.activation,
+    )
     return Agent(
         policy=networks.init_network(policy, optimizer),
         value=networks.init_network(value, optimizer),

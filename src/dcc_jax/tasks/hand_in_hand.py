@@ -109,13 +109,7 @@ class HandInHand(Task):
         self, key: Array, references: References, begin: bool
     ) -> RefState:
         """Any moment of a stride at one of the partner's speeds; or a stand."""
-        speed_key, phase_key = jax.random.split(key)
-        speed = jax.random.choice(speed_key, jnp.array(self.gaits.speeds))
-        phase = jax.random.uniform(phase_key)
-        if begin:
-            speed = 0.0 * speed
-        loops = strides.strides(references)
-        begins = strides.begin(references, loops, phase, speed, CONTROL_DT)
+        begins = strides.first_reference(key, references, self.gaits, begin)
         return _reaching(references.coords, begins)
 
     def reference(
@@ -131,9 +125,7 @@ class HandInHand(Task):
     ) -> tuple[State, Array, Array]:
         """The partner goes as the reference does, its hand where the reference's is."""
         root, before = reference.qpos[:2], reference.qpos_previous[:2]
-        ahead = quat.rotate(quat.heading(reference.qpos[3:7]), jnp.array([1.0, 0, 0]))
-        facing = jnp.arctan2(ahead[1], ahead[0])
-        motion = partner.begin(key, self.gaits, root, reference.qvel[:2], facing)
+        motion = strides.first_motion(key, self.gaits, reference)
         now = partner.to_path(palm(reference.qpos), root, motion.heading)
         then = partner.to_path(palm(reference.qpos_previous), before, motion.heading)
         state = State(

@@ -16,8 +16,9 @@ import numpy as np
 
 from dcc_jax import quat
 from dcc_jax.character import load_character
-from dcc_jax.motion.reference import References, RefState, planar_moved
-from dcc_jax.tasks.partner import Motion, direction, path
+from dcc_jax.motion.reference import CONTROL_DT, References, RefState, planar_moved
+from dcc_jax.tasks import partner
+from dcc_jax.tasks.partner import Gaits, Motion, direction, path
 
 Array = jax.Array
 
@@ -97,6 +98,33 @@ def strides(references: References) -> Strides:
         cadences=tuple(float(x) for x in cadences),
         offsets=tuple(_offset(references, int(i)) for i in order),
     )
+
+
+def first_reference(
+    key: Array, references: References, gaits: Gaits, stands: bool
+) -> RefState:
+    """Any moment of a stride at one of the speeds, or of a stand.
+
+    Args:
+        key: consumed.
+        references: the loops.
+        gaits: whose speeds they are.
+        stands: at rest in any case.
+    """
+    speed_key, phase_key = jax.random.split(key)
+    speed = jax.random.choice(speed_key, jnp.array(gaits.speeds))
+    phase = jax.random.uniform(phase_key)
+    if stands:
+        speed = 0.0 * speed
+    return begin(references, strides(references), phase, speed, CONTROL_DT)
+
+
+def first_motion(key: Array, gaits: Gaits, reference: RefState) -> Motion:
+    """A motion that goes on for a while as the reference does at the reset."""
+    ahead = quat.rotate(quat.heading(reference.qpos[3:7]), jnp.array([1.0, 0, 0]))
+    facing = jnp.arctan2(ahead[1], ahead[0])
+    root, velocity = reference.qpos[:2], reference.qvel[:2]
+    return partner.begin(key, gaits, root, velocity, facing)
 
 
 def begin(

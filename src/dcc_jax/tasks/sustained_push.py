@@ -1,31 +1,39 @@
 """Sustained pushes (Sec. 5.2): stand, walk and run while forces pull at the body.
 
 Every now and then a force of constant direction acts on one body for a while, as wind
-or a dog on a lead would. It is fed to the compliance as it is. Loops of walking and
-running carry the reference's root along.
+or a dog on a lead would. It is fed to the compliance as it is. The reference goes along
+a path with stops, turns and changes of speed: a planner blends loops of walking and
+running by its speed (`tasks.strides`), and the character follows in time.
+
+Departure: the paper learns this skill with the discriminator (Sec. 4.1) and leaves the
+planner to its Appendix; as in `tasks.hand_in_hand`.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 
-from dcc_jax import physics
+from dcc_jax import physics, quat
+from dcc_jax.env import features
 from dcc_jax.env.task import Forces, Task, place_character
-from dcc_jax.motion.reference import CONTROL_DT, RefState
+from dcc_jax.motion.reference import CONTROL_DT, References, RefState
+from dcc_jax.tasks import partner, strides
+from dcc_jax.tasks.partner import Gaits, Motion
 
 Array = jax.Array
 
 
 @flax.struct.dataclass
 class State:
-    """The push that acts, and when it ends or the next one begins."""
+    """Where the character should go, and the push that acts or comes next."""
 
+    motion: Motion
     force_w: Array  # [3] N, zero in a pause
     target: Array  # [] int32, index into `SustainedPush.bodies`
     left: Array  # [] s of the push, or of the pause
@@ -39,12 +47,18 @@ class SustainedPush(Task):
     name: ClassVar[str] = "sustained-push"
     clips: ClassVar[tuple[str, ...]] = (
         "stand",
-        "balance",
+        "walk_slow_cycle",
         "walk_cycle",
+        "walk_fast_cycle",
         "jog_cycle",
         "run_cycle",
     )
+    tracks: ClassVar[bool] = True
+    state_size: ClassVar[int] = 6
     clock: ClassVar[str | None] = "since_push"
+
+    gaits: Gaits = field(default_factory=Gaits)
+    """Where it should go: stops, turns and changes of speed."""
 
     bodies: tuple[str, ...] = ("pelvis", "chest", "head", "left_hand", "right_hand")
     """That may be pushed, at their centres of mass."""
@@ -56,15 +70,33 @@ class SustainedPush(Task):
     """s between two."""
     slope: float = 0.3
     """rad, at most, of the force above or below the ground plane."""
+    farthest: float = 1.2
+    """m between the root and the reference's; beyond it the character is carried off
+    or left behind."""
+
+    def first_reference(
+        self, key: Array, references: References, begin: bool
+    ) -> RefState:
+        """Any moment of a stride at one of the speeds; or a stand."""
+        return strides.first_reference(key, references, self.gaits, begin)
+
+    def reference(
+        self, references: References, state: State, at: RefState, elapsed: float
+    ) -> RefState:
+        """Along the path."""
+        loops = strides.strides(references)
+        return strides.go_on(references, loops, state.motion, at, elapsed)
 
     def reset(
         self, key: Array, scene: physics.Scene, reference: RefState
     ) -> tuple[State, Array, Array]:
         """It begins in a pause."""
+        pause_key, motion_key = jax.random.split(key)
         state = State(
+            motion=strides.first_motion(motion_key, self.gaits, reference),
             force_w=jnp.zeros(3),
             target=jnp.zeros((), jnp.int32),
-            left=self.pause[1] * jax.random.uniform(key),
+            left=self.pause[1] * jax.random.uniform(pause_key),
             since=jnp.zeros(()),
         )
         return state, *place_character(scene, reference)
@@ -72,18 +104,21 @@ class SustainedPush(Task):
     def control_step(
         self, key: Array, scene: physics.Scene, state: State, body: physics.State
     ) -> tuple[State, physics.State]:
-        """Pushes and pauses take turns."""
-        rest_key, push_key = jax.random.split(key)
+        """The path goes on; pushes and pauses take turns."""
+        rest_key, push_key, motion_key = jax.random.split(key, 3)
         over = state.left <= 0.0
         pushing = jnp.any(state.force_w != 0.0)
         changed = jax.tree.map(
             lambda a, b: jnp.where(pushing, a, b),
             self._resting(rest_key, state),
-            self._pushing(push_key),
+            self._pushing(push_key, state),
         )
         state = jax.tree.map(lambda a, b: jnp.where(over, a, b), changed, state)
         return dataclasses.replace(
-            state, left=state.left - CONTROL_DT, since=state.since + CONTROL_DT
+            state,
+            motion=partner.go_on(motion_key, self.gaits, state.motion),
+            left=state.left - CONTROL_DT,
+            since=state.since + CONTROL_DT,
         ), body
 
     def _resting(self, key: Array, state: State) -> State:
@@ -91,7 +126,7 @@ class SustainedPush(Task):
         left = jax.random.uniform(key, minval=shortest, maxval=longest)
         return dataclasses.replace(state, force_w=jnp.zeros(3), left=left)
 
-    def _pushing(self, key: Array) -> State:
+    def _pushing(self, key: Array, state: State) -> State:
         keys = jax.random.split(key, 5)
         way = jax.random.uniform(keys[0], minval=-jnp.pi, maxval=jnp.pi)
         slope = jax.random.uniform(keys[1], minval=-self.slope, maxval=self.slope)
@@ -102,7 +137,8 @@ class SustainedPush(Task):
             [level * jnp.cos(way), level * jnp.sin(way), jnp.sin(slope)]
         )
         shortest, longest = self.duration
-        return State(
+        return dataclasses.replace(
+            state,
             force_w=size * direction,
             target=jax.random.randint(keys[3], (), 0, len(self.bodies)),
             left=jax.random.uniform(keys[4], minval=shortest, maxval=longest),
@@ -140,14 +176,42 @@ class SustainedPush(Task):
         body = jnp.array([scene.body(name) for name in self.bodies])[state.target]
         return body, kin.body_center[body]
 
+    def observe(self, scene: physics.Scene, state: State, body: physics.State) -> Array:
+        """The way to the reference's root, its velocity and cos and sin of its path,
+        over the ground [6]. The push is felt, not seen."""
+        origin, facing = features.local_frame(scene.character_qpos(body.qpos))
+        root, heading, speed = partner.path(state.motion, _end(state))
+        ahead = partner.direction(heading)
+        seen = jnp.stack([root - origin[:2], speed * ahead, ahead])
+        level = jnp.pad(seen, ((0, 0), (0, 1)))
+        return quat.rotate(quat.inv(facing), level)[:, :2].reshape(-1)
+
+    def terminated(
+        self, scene: physics.Scene, state: State, body: physics.State
+    ) -> Array:
+        """It is too far from where it should be."""
+        return self.evaluate(scene, state, body)["path_distance"] > self.farthest
+
     def evaluate(
         self, scene: physics.Scene, state: State, body: physics.State
     ) -> dict[str, Array]:
-        """The push (N), the speed of the root over the ground (m/s), and the time since
-        the last push began (s)."""
-        velocity = scene.character_qvel(body.qvel)[:2]
+        """The push (N), the speeds of the root and of its path over the ground (m/s),
+        the distance between the two (m), and the time since the last push began (s)."""
+        root, _, speed = partner.path(state.motion, _end(state))
+        q, qd = scene.character_qpos(body.qpos), scene.character_qvel(body.qvel)
         return {
-            "push": jnp.sqrt(jnp.sum(jnp.square(state.force_w)) + 1e-12),
-            "speed": jnp.sqrt(jnp.sum(jnp.square(velocity)) + 1e-12),
+            "push": _length(state.force_w),
+            "speed": _length(qd[:2]),
+            "path_speed": speed,
+            "path_distance": _length(q[:2] - root),
             "since_push": state.since,
         }
+
+
+def _end(state: State) -> Array:
+    """The end of the control step, when it is judged and observed."""
+    return state.motion.time + CONTROL_DT
+
+
+def _length(vector: Array) -> Array:
+    return jnp.sqrt(jnp.sum(jnp.square(vector)) + 1e-12)
