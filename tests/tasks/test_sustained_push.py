@@ -30,10 +30,11 @@ def references():
 @pytest.fixture(scope="module")
 def schedules(scene, references):
     """States of PUSHED characters after each of STEPS control steps, [T, B]."""
-    stand_key, reset_key, run_key = jax.random.split(jax.random.key(0), 3)
+    stand_key, body_key, reset_key, run_key = jax.random.split(jax.random.key(0), 4)
     standing = TASK.first_reference(stand_key, references, True)
     begin = jax.vmap(lambda key: TASK.reset(key, scene, standing)[0])
-    go_on = jax.vmap(lambda key, state: TASK.control_step(key, scene, state, None)[0])
+    body = physics.initial_state(scene, *TASK.reset(body_key, scene, standing)[1:])
+    go_on = jax.vmap(lambda key, state: TASK.control_step(key, scene, state, body)[0])
 
     @jax.jit
     def run(first, keys):
@@ -132,11 +133,13 @@ def test_a_push_accelerates_the_character_by_force_over_mass(
 
 def test_path_stops_and_runs_and_the_reference_keeps_to_it(scene, references):
     first = TASK.first_reference(jax.random.key(1), references, False)
-    state, *_ = TASK.reset(jax.random.key(2), scene, first)
+    state, qpos, qvel = TASK.reset(jax.random.key(2), scene, first)
+    body = physics.initial_state(scene, qpos, qvel)
 
     @jax.jit
     def step(key, state, reference):
-        state, _ = TASK.control_step(key, scene, state, None)
+        there = dataclasses.replace(body, qpos=qpos.at[:55].set(reference.qpos))
+        state, _ = TASK.control_step(key, scene, state, there)
         return state, TASK.reference(references, state, reference, CONTROL_DT)
 
     speeds, reference = [], first
@@ -186,15 +189,16 @@ def test_path_is_seen_in_the_characters_frame(scene, references):
         np.testing.assert_allclose(back, spun, atol=1e-4)
 
 
-@pytest.mark.parametrize(("away", "ends"), [(1.1, False), (1.3, True)])
-def test_episode_ends_where_the_path_is_left(scene, references, away, ends):
+@pytest.mark.parametrize(("away", "left"), [(0.7, 0.7), (1.3, 0.8)])
+def test_path_waits_for_who_is_left_behind(scene, references, away, left):
     first = TASK.first_reference(jax.random.key(0), references, True)
     state, qpos, qvel = TASK.reset(jax.random.key(0), scene, first)
-    body = physics.initial_state(scene, qpos.at[0].add(away), qvel)
-    assert TASK.evaluate(scene, state, body)["path_distance"] == pytest.approx(
-        away, abs=1e-3
-    )
-    assert bool(TASK.terminated(scene, state, body)) is ends
+    body = physics.initial_state(scene, qpos.at[1].add(away), qvel)
+    later, _ = TASK.control_step(jax.random.key(0), scene, state, body)
+    numbers = TASK.evaluate(scene, later, body)
+    assert numbers["path_distance"] == pytest.approx(left, abs=1e-3)
+    # On the line between the two.
+    assert later.motion.position[0] == pytest.approx(float(qpos[0]), abs=1e-5)
 
 
 def _facing(qpos) -> float:

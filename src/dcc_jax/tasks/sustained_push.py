@@ -3,7 +3,9 @@
 Every now and then a force of constant direction acts on one body for a while, as wind
 or a dog on a lead would. It is fed to the compliance as it is. The reference goes along
 a path with stops, turns and changes of speed: a planner blends loops of walking and
-running by its speed (`tasks.strides`), and the character follows in time.
+running by its speed (`tasks.strides`), and the character follows in time. The path
+waits for who is left behind and gives way to who is carried off: it goes on from within
+`leash` of the character.
 
 Departure: the paper learns this skill with the discriminator (Sec. 4.1) and leaves the
 planner to its Appendix; as in `tasks.hand_in_hand`.
@@ -70,9 +72,9 @@ class SustainedPush(Task):
     """s between two."""
     slope: float = 0.3
     """rad, at most, of the force above or below the ground plane."""
-    farthest: float = 1.2
-    """m between the root and the reference's; beyond it the character is carried off
-    or left behind."""
+    leash: float = 0.8
+    """m, at most, between the root and the reference's at the start of a control step.
+    With a path that did not wait, most episodes ended where it was lost."""
 
     def first_reference(
         self, key: Array, references: References, begin: bool
@@ -114,9 +116,14 @@ class SustainedPush(Task):
             self._pushing(push_key, state),
         )
         state = jax.tree.map(lambda a, b: jnp.where(over, a, b), changed, state)
+        motion = partner.go_on(motion_key, self.gaits, state.motion)
+        root = scene.character_qpos(body.qpos)[:2]
+        away = motion.position - root
+        within = jnp.minimum(1.0, self.leash / _length(away))
+        motion = dataclasses.replace(motion, position=root + within * away)
         return dataclasses.replace(
             state,
-            motion=partner.go_on(motion_key, self.gaits, state.motion),
+            motion=motion,
             left=state.left - CONTROL_DT,
             since=state.since + CONTROL_DT,
         ), body
@@ -185,12 +192,6 @@ class SustainedPush(Task):
         seen = jnp.stack([root - origin[:2], speed * ahead, ahead])
         level = jnp.pad(seen, ((0, 0), (0, 1)))
         return quat.rotate(quat.inv(facing), level)[:, :2].reshape(-1)
-
-    def terminated(
-        self, scene: physics.Scene, state: State, body: physics.State
-    ) -> Array:
-        """It is too far from where it should be."""
-        return self.evaluate(scene, state, body)["path_distance"] > self.farthest
 
     def evaluate(
         self, scene: physics.Scene, state: State, body: physics.State
