@@ -69,14 +69,7 @@ class HandInHand(Task):
     """Stand, walk, jog and run where the partner goes."""
 
     name: ClassVar[str] = "hand-in-hand"
-    clips: ClassVar[tuple[str, ...]] = (
-        "stand",
-        "walk_slow_cycle",
-        "walk_cycle",
-        "walk_fast_cycle",
-        "jog_cycle",
-        "run_cycle",
-    )
+    clips: ClassVar[tuple[str, ...]] = strides.LOOPS
     tracks: ClassVar[bool] = True
     state_size: ClassVar[int] = 8
 

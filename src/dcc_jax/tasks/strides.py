@@ -22,6 +22,15 @@ from dcc_jax.tasks.partner import Gaits, Motion, direction, path
 
 Array = jax.Array
 
+LOOPS = (
+    "stand",
+    "walk_slow_cycle",
+    "walk_cycle",
+    "walk_fast_cycle",
+    "jog_cycle",
+    "run_cycle",
+)
+"""Clips of the package that go together as strides."""
 STANDS = 0.05  # m/s; a loop that is slower has no strides
 _SAMPLES = 64  # of a period, to find its phase
 

@@ -47,14 +47,7 @@ class SustainedPush(Task):
     """Stand, walk or run, whoever pulls."""
 
     name: ClassVar[str] = "sustained-push"
-    clips: ClassVar[tuple[str, ...]] = (
-        "stand",
-        "walk_slow_cycle",
-        "walk_cycle",
-        "walk_fast_cycle",
-        "jog_cycle",
-        "run_cycle",
-    )
+    clips: ClassVar[tuple[str, ...]] = strides.LOOPS
     tracks: ClassVar[bool] = True
     state_size: ClassVar[int] = 6
     clock: ClassVar[str | None] = "since_push"
