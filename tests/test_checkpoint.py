@@ -135,7 +135,7 @@ def test_another_network_size_is_refused_by_name(run_dir):
 
 def _policy() -> Policy:
     return Policy(
-        params=networks.init_mlp(jax.random.key(0), (5, 8, 8, 2)),
+        params=networks.init_mlp(jax.random.key(0), (5, 8, 8, 2), activation="elu"),
         normalizer=normalizer.moments(jax.random.normal(jax.random.key(1), (20, 5))),
     )
 

@@ -233,7 +233,7 @@ def test_bad_input_is_one_line_and_status_two(argv, parts, push, tmp_path, capsy
         (made[name] / "config.json").write_text(json.dumps(changed))
     with np.load(made["smaller"] / "policy.npz") as archive:
         arrays = dict(archive)
-    arrays["params.0.kernel"] = arrays["params.0.kernel"][:20]
+    arrays["params.layers.0.kernel"] = arrays["params.layers.0.kernel"][:20]
     np.savez(made["smaller"] / "policy.npz", **arrays)
     assert command.main([part.format(**made) for part in argv]) == 2
     lines = capsys.readouterr().err.strip().splitlines()
