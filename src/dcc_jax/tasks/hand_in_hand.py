@@ -194,7 +194,7 @@ class HandInHand(Task):
     def observe(self, scene: physics.Scene, state: State, body: physics.State) -> Array:
         """The partner's hand, its velocity [6], and cos and sin of the way it goes."""
         origin, facing = features.local_frame(scene.character_qpos(body.qpos))
-        now = _end(state)
+        now = partner.end(state.motion)
         position, velocity = self.hand(state, now)
         _, heading, _ = partner.path(state.motion, now)
         ahead = jnp.append(partner.direction(heading), 0.0)
@@ -215,13 +215,13 @@ class HandInHand(Task):
         """Of a control step: mean square (N^2) and peak (N) of the joint's force, gap
         between the hands and distance to the path (m), speed of the partner (m/s)."""
         q = scene.character_qpos(body.qpos)
-        root, _, speed = partner.path(state.motion, _end(state))
-        hand, _ = self.hand(state, _end(state))
+        root, _, speed = partner.path(state.motion, partner.end(state.motion))
+        hand, _ = self.hand(state, partner.end(state.motion))
         return {
             "hand_force_square": state.force_square / CONTROL_DT,
             "hand_force_peak": state.force_peak,
-            "hand_gap": _length(palm(q) - hand),
-            "path_distance": _length(q[:2] - root),
+            "hand_gap": partner.length(palm(q) - hand),
+            "path_distance": partner.length(q[:2] - root),
             "partner_speed": speed,
         }
 
@@ -257,20 +257,11 @@ def _kinematics() -> features.Kinematics:
     return features.Kinematics.of(compose_scene(load_character(), floor=False))
 
 
-def _end(state: State) -> Array:
-    """The end of the control step, when it is judged and observed."""
-    return state.motion.time + CONTROL_DT
-
-
 def _settling(state: State, time: Array) -> Array:
     """What is left of the hands' first offset [3] m: a critically damped return."""
     rate = 1.0 / SETTLING_TIME
     push = state.first_drift + rate * state.first_hand
     return (state.first_hand + time * push) * jnp.exp(-rate * time)
-
-
-def _length(vector: Array) -> Array:
-    return jnp.sqrt(jnp.sum(jnp.square(vector)) + 1e-12)
 
 
 def _add_figure(body: mujoco.MjsBody) -> None:

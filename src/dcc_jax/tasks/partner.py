@@ -67,7 +67,7 @@ def begin(
         velocity: of it [2], m/s. Below `SWAY` it stands, and will go where it faces.
         facing: heading of the reference, rad.
     """
-    speed = jnp.sqrt(jnp.sum(jnp.square(velocity)) + 1e-12)
+    speed = length(velocity)
     goes = speed > SWAY
     heading = jnp.where(goes, jnp.arctan2(velocity[1], velocity[0]), facing)
     speed = jnp.where(goes, speed, 0.0)
@@ -115,6 +115,16 @@ def path(motion: Motion, time: Array) -> tuple[Array, Array, Array]:
     )
 
 
+def end(motion: Motion) -> Array:
+    """The end of the control step in s, when it is judged and observed."""
+    return motion.time + CONTROL_DT
+
+
+def length(vector: Array) -> Array:
+    """|vector| [], differentiable at zero."""
+    return jnp.sqrt(jnp.sum(jnp.square(vector)) + 1e-12)
+
+
 def direction(heading: Array) -> Array:
     """The unit vector [2] of a heading in rad."""
     return jnp.stack([jnp.cos(heading), jnp.sin(heading)])
@@ -136,7 +146,7 @@ def from_path(offset: Array, root: Array, heading: Array) -> Array:
 
 
 def _advanced(motion: Motion) -> Motion:
-    now = motion.time + CONTROL_DT
+    now = end(motion)
     position, heading, speed = path(motion, now)
     return dataclasses.replace(
         motion, time=now, position=position, heading=heading, speed=speed

@@ -112,7 +112,7 @@ class SustainedPush(Task):
         motion = partner.go_on(motion_key, self.gaits, state.motion)
         root = scene.character_qpos(body.qpos)[:2]
         away = motion.position - root
-        within = jnp.minimum(1.0, self.leash / _length(away))
+        within = jnp.minimum(1.0, self.leash / partner.length(away))
         motion = dataclasses.replace(motion, position=root + within * away)
         return dataclasses.replace(
             state,
@@ -180,7 +180,7 @@ class SustainedPush(Task):
         """The way to the reference's root, its velocity and cos and sin of its path,
         over the ground [6]. The push is felt, not seen."""
         origin, facing = features.local_frame(scene.character_qpos(body.qpos))
-        root, heading, speed = partner.path(state.motion, _end(state))
+        root, heading, speed = partner.path(state.motion, partner.end(state.motion))
         ahead = partner.direction(heading)
         seen = jnp.stack([root - origin[:2], speed * ahead, ahead])
         level = jnp.pad(seen, ((0, 0), (0, 1)))
@@ -191,21 +191,12 @@ class SustainedPush(Task):
     ) -> dict[str, Array]:
         """The push (N), the speeds of the root and of its path over the ground (m/s),
         the distance between the two (m), and the time since the last push began (s)."""
-        root, _, speed = partner.path(state.motion, _end(state))
+        root, _, speed = partner.path(state.motion, partner.end(state.motion))
         q, qd = scene.character_qpos(body.qpos), scene.character_qvel(body.qvel)
         return {
-            "push": _length(state.force_w),
-            "speed": _length(qd[:2]),
+            "push": partner.length(state.force_w),
+            "speed": partner.length(qd[:2]),
             "path_speed": speed,
-            "path_distance": _length(q[:2] - root),
+            "path_distance": partner.length(q[:2] - root),
             "since_push": state.since,
         }
-
-
-def _end(state: State) -> Array:
-    """The end of the control step, when it is judged and observed."""
-    return state.motion.time + CONTROL_DT
-
-
-def _length(vector: Array) -> Array:
-    return jnp.sqrt(jnp.sum(jnp.square(vector)) + 1e-12)
