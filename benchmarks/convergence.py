@@ -13,6 +13,7 @@ import argparse
 import dataclasses
 
 from dcc_jax import runtime
+from dcc_jax.training import loop
 
 runtime.setup()
 
@@ -20,7 +21,7 @@ import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
-from dcc_jax import physics, tasks  # noqa: E402
+from dcc_jax import physics  # noqa: E402
 from dcc_jax.config import make_config  # noqa: E402
 from dcc_jax.env.environment import Environment  # noqa: E402
 from dcc_jax.env.state import EnvState  # noqa: E402
@@ -94,7 +95,7 @@ def main() -> None:
     args = parser.parse_args()
     print(f"{'at most':15s}" + "".join(f"{n:>9d}" for n in AT_MOST))
     for name in args.tasks:
-        shares = measured(tasks.make_environment(make_config(name)), args.steps)
+        shares = measured(loop.make_environment(make_config(name)), args.steps)
         print(f"{name:15s}" + "".join(f"{s:9.2%}" for s in shares), flush=True)
 
 

@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from dcc_jax import runtime
+from dcc_jax.training import loop
 
 runtime.setup()
 
@@ -37,7 +38,7 @@ import mujoco  # noqa: E402
 from jax.sharding import NamedSharding, PartitionSpec  # noqa: E402
 from mujoco import mjx  # noqa: E402
 
-from dcc_jax import physics, tasks  # noqa: E402
+from dcc_jax import physics  # noqa: E402
 from dcc_jax.character import compose_scene, load_character  # noqa: E402
 from dcc_jax.config import Config, make_config  # noqa: E402
 from dcc_jax.control import pd  # noqa: E402
@@ -152,7 +153,7 @@ def medians(variants: dict[str, Callable[[], None]], rounds: int) -> dict[str, f
 
 def split(config: Config, rounds: int) -> dict[str, float]:
     """Tuples per second end to end, and the share of each part."""
-    environment = tasks.make_environment(config)
+    environment = loop.make_environment(config)
     epochs, minibatches = config.ppo.epochs, config.disc.minibatches
     seconds = medians(
         {

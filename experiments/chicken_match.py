@@ -29,7 +29,7 @@ from dcc_jax import runtime
 from dcc_jax.evaluate import bootstrap
 
 if TYPE_CHECKING:
-    from dcc_jax.evaluate.runs import Run
+    from dcc_jax.play.runs import Run
     from dcc_jax.tasks.match import Match
 
 DT = 1.0 / 30.0  # s, the control step
@@ -61,12 +61,12 @@ def play(match: Match, runs: list[Run], level: float, count: int, steps: int, se
 
     from dcc_jax.env.environment import ALPHA_ENTRY
 
-    told = [float(np.clip(level, *run.alphas)) for run in runs]
+    observed_alpha = [float(np.clip(level, *run.alphas)) for run in runs]
 
     def act(sides):
         return tuple(
             run.policy.mean(side.obs.at[ALPHA_ENTRY].set(alpha))
-            for run, side, alpha in zip(runs, sides, told, strict=True)
+            for run, side, alpha in zip(runs, sides, observed_alpha, strict=True)
         )
 
     def step(sides, keys):
@@ -240,9 +240,9 @@ def main() -> None:
     add("--video", type=Path, metavar="FILE.mp4", help="the first match, last level")
     options = parser.parse_args()
     runtime.setup()
-    from dcc_jax import draw as pictures
-    from dcc_jax.evaluate.runs import find_run, make_environment
+    from dcc_jax.play.runs import find_run, make_environment
     from dcc_jax.tasks.match import Match
+    from dcc_jax.viz import draw as pictures
 
     runs = [find_run(path) for path in (options.heavy, options.light)]
     if options.mass is not None:

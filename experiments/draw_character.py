@@ -9,9 +9,9 @@ import numpy as np
 from matplotlib.image import imsave
 from scipy.spatial.transform import Rotation
 
-from dcc_jax import draw
 from dcc_jax.character import asset_path, compose_scene, load_character
 from dcc_jax.motion.clip import load_clip
+from dcc_jax.viz import draw
 
 PICTURE = Path(__file__).resolve().parents[1] / "docs" / "character.png"
 POSES = (

@@ -25,6 +25,7 @@ import itertools
 import numpy as np
 
 from dcc_jax import runtime
+from dcc_jax.training import loop
 
 runtime.setup()
 
@@ -32,7 +33,7 @@ import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import mujoco  # noqa: E402
 
-from dcc_jax import config, tasks  # noqa: E402
+from dcc_jax import config  # noqa: E402
 from dcc_jax.env.config import CONTROL_RATE  # noqa: E402
 from dcc_jax.env.environment import Environment  # noqa: E402
 from dcc_jax.tasks.ball import Ball  # noqa: E402
@@ -183,7 +184,7 @@ def main() -> None:
     options = parser.parse_args()
     wanted = config.make_config(options.task)
     env = dataclasses.replace(wanted.env, alpha=0.0)
-    environment = tasks.make_environment(dataclasses.replace(wanted, env=env))
+    environment = loop.make_environment(dataclasses.replace(wanted, env=env))
     if isinstance(environment.task, Ball):
         environment.task = dataclasses.replace(environment.task, tilt=0.0)
     system = System(environment, options.time)

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from dcc_jax import training
 from dcc_jax.config import Config, make_config
+from dcc_jax.training import loop
 
 ALPHAS = (0.0, 0.16)
 
@@ -33,5 +33,5 @@ def smoke_run(task: str, factory: pytest.TempPathFactory) -> Path:
     with (shared / f"{task}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not (run_dir / "policy.npz").exists():
-            training.train(smoke_config(task), run_dir=run_dir, quiet=True)
+            loop.train(smoke_config(task), run_dir=run_dir, quiet=True)
     return run_dir

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dcc_jax import checkpoint
 from dcc_jax.learn import networks, normalizer
 from dcc_jax.learn.rollout import Policy
+from dcc_jax.training import checkpoint
 
 
 @flax.struct.dataclass

@@ -7,7 +7,7 @@ import json
 import matplotlib.image
 import pytest
 
-from dcc_jax import curves
+from dcc_jax.training import curves
 
 
 @pytest.fixture

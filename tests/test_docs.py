@@ -13,8 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dcc_jax import physics, tasks, training
+from dcc_jax import physics, tasks
 from dcc_jax.config import make_config
+from dcc_jax.training import loop
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -32,7 +33,7 @@ def test_readme_has_its_commands():
         "train",
         "evaluate",
         "render",
-        "curves",
+        "training.curves",
         "motion",
     }
 
@@ -49,7 +50,7 @@ def test_command_of_the_readme_is_understood(command, monkeypatch):
         raise Understood
 
     monkeypatch.setattr(argparse.ArgumentParser, "parse_args", understood)
-    monkeypatch.setattr(training, "prepare", prepared)
+    monkeypatch.setattr(loop, "prepare", prepared)
     name, *arguments = shlex.split(command, comments=True)
     package = "dcc_jax." + name
     if (ROOT / "src/dcc_jax" / name).is_dir():
@@ -68,7 +69,7 @@ def test_task_of_the_walkthrough_pulls_at_the_hand_as_it_says(tmp_path, monkeypa
     monkeypatch.syspath_prepend(tmp_path)
     rubber_band = importlib.import_module("rubber_band")
     task = rubber_band.RubberBand()
-    environment = tasks.make_environment(make_config("rubber-band", "smoke"), task)
+    environment = tasks.make_environment(task, make_config("push", "smoke").env)
     key = jax.random.key(0)
     state = jax.eval_shape(environment.reset, key)
     action = jnp.zeros(environment.action_size)

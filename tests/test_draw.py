@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from dcc_jax import draw
-from dcc_jax.draw_plain import Camera
+from dcc_jax.viz import draw
+from dcc_jax.viz.fallback import Camera
 
 SCENE = """<mujoco><worldbody>
 <geom type="plane" size="5 5 .1"/>

@@ -16,9 +16,10 @@ import pytest
 from matplotlib.image import imread
 
 from dcc_jax.env.environment import ALPHA_ENTRY
-from dcc_jax.evaluate import report, runs
-from dcc_jax.evaluate.episodes import Player
-from dcc_jax.evaluate.recording import Recording
+from dcc_jax.evaluate import report
+from dcc_jax.play import runs
+from dcc_jax.play.player import Player
+from dcc_jax.play.recording import Recording
 from dcc_jax.tasks.push import Push
 
 # The package shows the function of that name; these tests want the module.
@@ -34,13 +35,13 @@ def push(smoke_run: Callable[[str], Path]) -> Path:
 
 
 @pytest.fixture(scope="module")
-def plan(push: Path) -> report.Plan:
+def plan(push: Path) -> report.EvaluationPlan:
     """Two levels of compliance of one policy; its program serves the whole file."""
     return report.prepare(push, EPISODES, None, 3, SECONDS, None, lambda text: None)
 
 
 @pytest.fixture(scope="module")
-def found(plan: report.Plan) -> report.Report:
+def found(plan: report.EvaluationPlan) -> report.Report:
     return report.execute(plan, lambda done, total: None)
 
 
@@ -50,7 +51,7 @@ def _trained_at(run: runs.Run, alpha: float) -> runs.Run:
     return dataclasses.replace(run, config=dataclasses.replace(run.config, env=env))
 
 
-def _play(plan: report.Plan, alpha: float) -> Recording:
+def _play(plan: report.EvaluationPlan, alpha: float) -> Recording:
     run, _ = plan.conditions[0]
     return plan.players[run.name].play(
         _trained_at(run, 0.16),
@@ -63,7 +64,7 @@ def _play(plan: report.Plan, alpha: float) -> Recording:
 
 
 @pytest.fixture(scope="module")
-def recordings(plan: report.Plan) -> tuple[Recording, Recording]:
+def recordings(plan: report.EvaluationPlan) -> tuple[Recording, Recording]:
     """At alpha = 0 and at the largest there is, where the difference shows."""
     return _play(plan, 0.0), _play(plan, 1.0)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dcc_jax.character import asset_path
-from dcc_jax.evaluate import runs
+from dcc_jax.play import runs
 
 SHIPPED = sorted(entry.name for entry in asset_path("policies").iterdir())
 

@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from dcc_jax import draw, quat
+from dcc_jax import quat
 from dcc_jax.config import make_config
-from dcc_jax.evaluate.recording import Motion, displaced
+from dcc_jax.play.recording import Motion, displaced
 from dcc_jax.render import film
 from dcc_jax.tasks import make_environment
+from dcc_jax.viz import draw
 
 # The package shows the function of that name; these tests want the module.
 command = importlib.import_module("dcc_jax.render.__main__")
@@ -31,14 +32,14 @@ def push(smoke_run: Callable[[str], Path]) -> Path:
 
 
 @pytest.fixture(scope="module")
-def plan(push: Path, tmp_path_factory: pytest.TempPathFactory) -> film.Plan:
+def plan(push: Path, tmp_path_factory: pytest.TempPathFactory) -> film.FilmPlan:
     folder = tmp_path_factory.mktemp("film")
     mp4, png = folder / "new" / "a.mp4", folder / "a.png"
     return film.prepare(push, mp4, SECONDS, None, 3, png, None)
 
 
 @pytest.fixture(scope="module")
-def shot(plan: film.Plan) -> film.Shot:
+def shot(plan: film.FilmPlan) -> film.Shot:
     """What `python -m dcc_jax.render` does, without its command line."""
     found = film.play(plan)
     film.write(plan, found.images)
@@ -68,7 +69,7 @@ def test_largest_compliance_of_the_training_is_shown_at_first(plan):
 
 
 def test_strip_alone_needs_no_video_and_draws_its_frames_alone(plan):
-    alone = film.Plan(**{**vars(plan), "out": None})
+    alone = film.FilmPlan(**{**vars(plan), "out": None})
     assert film.play(alone).count == 12
 
 
@@ -147,7 +148,7 @@ def test_ghost_is_the_pose_without_u():
 
 def test_without_opengl_matplotlib_draws(plan, monkeypatch):
     monkeypatch.setattr(draw, "opengl_works", lambda: False)
-    still = film.Plan(**{**vars(plan), "out": None})
+    still = film.FilmPlan(**{**vars(plan), "out": None})
     images = list(film.play(still).images)
     assert len(images) == 12
     assert all(image.shape == (480, 640, 3) and image.std() > 5.0 for image in images)

@@ -8,9 +8,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from dcc_jax import physics, solver, tasks
+from dcc_jax import physics, tasks
 from dcc_jax.character import Character, compose_scene
-from dcc_jax.sparsity import arrow
+from dcc_jax.physics import contact_solver
+from dcc_jax.physics.sparsity import arrow
 
 BATCH = 3
 
@@ -82,7 +83,7 @@ def test_mass_solve_is_the_dense_one(scene):
     p = _problem(shape, 0)
     forces = np.stack([p["smooth"], p["start"]], axis=1)
     less = np.linspace(0.0, 2.0, shape.nv)
-    solve = jax.jit(jax.vmap(lambda m, f: solver.solve_mass(shape, m, less, f)))
+    solve = jax.jit(jax.vmap(lambda m, f: contact_solver.solve_mass(shape, m, less, f)))
     x = solve(jnp.asarray(p["mass"], jnp.float32), jnp.asarray(forces, jnp.float32))
     mass = p["mass"] - np.diag(less)
     dense = np.linalg.solve(mass, forces.swapaxes(1, 2)).swapaxes(1, 2)
@@ -95,8 +96,8 @@ def test_optimum_satisfies_the_conditions_of_the_convex_problem(shape):
     num_equality = min(5, shape.num_rows)
 
     def one(mass, smooth, J, D, aref, start):
-        rows = solver.Rows(J, D, aref, num_equality)
-        return solver.newton(shape, mass, smooth, rows, start, 8)
+        rows = contact_solver.Rows(J, D, aref, num_equality)
+        return contact_solver.newton(shape, mass, smooth, rows, start, 8)
 
     single = [jnp.asarray(value, jnp.float32) for value in p.values()]
     qacc, force = (np.asarray(x, float) for x in jax.jit(jax.vmap(one))(*single))
@@ -118,8 +119,8 @@ def test_iteration_stops_where_it_has_arrived_and_no_environment_notices_others(
 
     def solved(most: int, problem: list) -> tuple[jax.Array, jax.Array]:
         def one(mass, smooth, J, D, aref, start):
-            rows = solver.Rows(J, D, aref, min(5, shape.num_rows))
-            return solver.newton(shape, mass, smooth, rows, start, most)
+            rows = contact_solver.Rows(J, D, aref, min(5, shape.num_rows))
+            return contact_solver.newton(shape, mass, smooth, rows, start, most)
 
         return jax.jit(jax.vmap(one))(*problem)
 
@@ -147,7 +148,9 @@ def test_limbs_that_touch_each_other_are_solved_together():
     p = _problem(joined, 2)
 
     def one(mass, smooth, J, D, aref, start):
-        return solver.newton(joined, mass, smooth, solver.Rows(J, D, aref, 1), start, 2)
+        return contact_solver.newton(
+            joined, mass, smooth, contact_solver.Rows(J, D, aref, 1), start, 2
+        )
 
     qacc, _ = jax.vmap(one)(*(jnp.asarray(v, jnp.float32) for v in p.values()))
     J, D = p["J"], p["D"][..., None]

@@ -9,14 +9,14 @@ import importlib
 import jax
 import numpy as np
 import pytest
+
+from dcc_jax.learn import learner
 from toy import Toy
 from toy_learner import compiled_toy
 from toy_run import toy_config
 
-from dcc_jax.learn import learner
-
 # The package shows the function of that name; these tests want the module.
-sweeping = importlib.import_module("dcc_jax.sweep")
+sweeping = importlib.import_module("dcc_jax.training.sweep")
 
 SEEDS, ALPHAS, UPDATES = (3, 4), (0.0, 0.8), 30
 

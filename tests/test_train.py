@@ -11,7 +11,8 @@ from pathlib import Path
 import jax
 import pytest
 
-from dcc_jax import config, options, training
+from dcc_jax import config, options
+from dcc_jax.training import loop
 
 # The package shows the function of that name; these tests want the module.
 train = importlib.import_module("dcc_jax.train")
@@ -123,11 +124,11 @@ def test_command_leaves_with_status_two():
 
 
 def test_failed_run_is_one_line_and_status_one(monkeypatch, capsys, tmp_path):
-    def fail(run: training.Run) -> None:
-        raise training.RunError("disk full")
+    def fail(run: loop.Run) -> None:
+        raise loop.RunError("disk full")
 
-    monkeypatch.setattr(training, "execute", fail)
-    monkeypatch.setattr(training, "make_environment", lambda wanted: None)
+    monkeypatch.setattr(loop, "execute", fail)
+    monkeypatch.setattr(loop, "make_environment", lambda wanted: None)
     assert train.main([*SMOKE, "--run-dir", str(tmp_path / "run")]) == 1
     assert capsys.readouterr().err == "dcc_jax.train: disk full\n"
 
@@ -135,11 +136,11 @@ def test_failed_run_is_one_line_and_status_one(monkeypatch, capsys, tmp_path):
 def test_error_nobody_foresaw_is_one_line_with_details_in_a_file(
     monkeypatch, capsys, tmp_path
 ):
-    def fail(run: training.Run) -> None:
+    def fail(run: loop.Run) -> None:
         raise ZeroDivisionError("one over zero\nand more")
 
-    monkeypatch.setattr(training, "execute", fail)
-    monkeypatch.setattr(training, "make_environment", lambda wanted: None)
+    monkeypatch.setattr(loop, "execute", fail)
+    monkeypatch.setattr(loop, "make_environment", lambda wanted: None)
     run_dir: Path = tmp_path / "run"
     assert train.main([*SMOKE, "--run-dir", str(run_dir)]) == 1
     lines = capsys.readouterr().err.strip().splitlines()

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from dcc_jax.training import checkpoint, logs, loop
 from toy import Toy
 from toy_run import INTERVAL, toy_config
-
-from dcc_jax import checkpoint, logs, training
 
 UPDATES = 60
 SCRIPT = Path(__file__).parent / "toy_run.py"
@@ -142,7 +142,7 @@ def test_progress_line_tells_how_far_and_how_well():
 
 
 def test_environment_that_breaks_is_counted_and_dumped(tmp_path):
-    result = training.train(
+    result = loop.train(
         toy_config(2),
         run_dir=tmp_path / "run",
         environment=Toy(poisoned=True),

@@ -8,14 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toy import Toy, ToyConfig
 
-from dcc_jax import quat, tasks
+from dcc_jax import quat
 from dcc_jax.config import make_config
 from dcc_jax.env.environment import Environment
 from dcc_jax.learn import learner
 from dcc_jax.learn.rollout import Policy
 from dcc_jax.learn.state import TrainConfig, TrainState
+from dcc_jax.training import loop
+from toy import Toy, ToyConfig
 
 
 def _begun(steps: int, devices: int) -> TrainState:
@@ -27,7 +28,7 @@ def _begun(steps: int, devices: int) -> TrainState:
 
 
 def _error(state: TrainState) -> float:
-    obs, action = jax.vmap(Toy().demonstration)(jax.random.split(jax.random.key(7), 99))
+    obs, action = jax.vmap(Toy().expert_action)(jax.random.split(jax.random.key(7), 99))
     policy = Policy(state.agent.policy.params, state.obs_normalizer)
     return float(jnp.sqrt(jnp.mean((policy.mean(obs) - action) ** 2)))
 
@@ -57,16 +58,16 @@ def test_negative_steps_are_refused():
 
 @pytest.fixture(scope="module", params=["trampoline", "door"])
 def environment(request) -> Environment:
-    return tasks.make_environment(make_config(request.param))
+    return loop.make_environment(make_config(request.param))
 
 
 def test_demonstration_asks_for_the_pose_a_little_later(environment):
-    obs, action = environment.demonstration(jax.random.key(3))
+    obs, action = environment.expert_action(jax.random.key(3))
     state = environment.reset(jax.random.key(3))
     np.testing.assert_array_equal(obs, state.obs)
     at = state.reference
     # The mean over the joints of kv / kp = 2 / sqrt(kp), kp 300 to 500, and dt / 2.
-    lead = environment.demonstration_lead
+    lead = environment.expert_lead
     assert 2 / np.sqrt(500) < lead - 1 / 60 < 2 / np.sqrt(300)
     _, plan = environment.begin(jax.random.key(4), state, action)
     coords = environment.kinematics.coords

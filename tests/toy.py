@@ -52,7 +52,7 @@ class Toy:
     feature_size: int = 2
     condition_size: int = 0
     has_task_reward: bool = False
-    tracks: bool = False
+    tracks_reference: bool = False
 
     def reset(self, key: Array, alpha: Array | None = None) -> ToyState:
         position = jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0)
@@ -73,7 +73,7 @@ class Toy:
         s = 0.2 * jax.random.normal(key, (n, 2))
         return s, 0.7 * s, jnp.zeros((n, 0))
 
-    def demonstration(self, key: Array) -> tuple[Array, Array]:
+    def expert_action(self, key: Array) -> tuple[Array, Array]:
         state = self.reset(key)
         return state.obs, -0.5 * state.features
 

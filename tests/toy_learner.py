@@ -10,9 +10,9 @@ from typing import Any
 import chex
 import jax
 import pytest
-from toy import Toy, ToyConfig
 
 from dcc_jax.learn import learner
+from toy import Toy, ToyConfig
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,8 @@ def toy_config(updates: int):
     """The toy under the real configuration's roof."""
     import dataclasses
 
-    from toy import ToyConfig
-
     from dcc_jax.config import Config
+    from toy import ToyConfig
 
     small = ToyConfig()
     return Config(
@@ -32,13 +31,12 @@ def toy_config(updates: int):
 
 def main(arguments: list[str]) -> int:
     runtime.setup()
+    from dcc_jax.training import loop
     from toy import Toy
-
-    from dcc_jax import training
 
     resume = "--resume" in arguments
     run_dir, updates = (a for a in arguments if a != "--resume")
-    result = training.train(
+    result = loop.train(
         toy_config(int(updates)), run_dir=run_dir, resume=resume, environment=Toy()
     )
     print("finished" if result.finished else "stopped")

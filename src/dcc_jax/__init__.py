@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from dcc_jax.control.stiffness import stiffness
     from dcc_jax.evaluate import evaluate
     from dcc_jax.render import render
-    from dcc_jax.sweep import sweep
     from dcc_jax.train import train
+    from dcc_jax.training.sweep import sweep
 
 __all__ = ["evaluate", "make_config", "render", "stiffness", "sweep", "train"]
 
@@ -26,7 +26,7 @@ _HOMES = {
     "train": "train",
     "evaluate": "evaluate",
     "render": "render",
-    "sweep": "sweep",
+    "sweep": "training.sweep",
     "stiffness": "control.stiffness",
 }
 

@@ -52,7 +52,7 @@ class Config:
 def make_config(task: str, preset: str = "cpu") -> Config:
     """The configuration of a task; `dataclasses.replace` changes it.
 
-    With `cpu` and `gpu` the task's own `settings` count, where it has any.
+    With `cpu` and `gpu` the task's own `config_overrides` count, where it has any.
 
     Args:
         task: its name.
@@ -63,7 +63,11 @@ def make_config(task: str, preset: str = "cpu") -> Config:
     """
     base = Config(task=task, preset=typing.cast(Preset, preset))
     made = _VARIANTS[preset](base)
-    own = TASKS[task].settings if task in TASKS and preset in ("cpu", "gpu") else {}
+    own = (
+        TASKS[task].config_overrides
+        if task in TASKS and preset in ("cpu", "gpu")
+        else {}
+    )
     for name, value in own.items():
         made = _replaced(made, name.split("."), value)
     return made

@@ -14,7 +14,7 @@ import tyro
 
 from dcc_jax import config
 from dcc_jax.config import Config
-from dcc_jax.training import default_run_dir
+from dcc_jax.training.loop import default_run_dir
 
 PROGRAM = "dcc_jax.train"
 _DESCRIPTION = """Trains a compliant policy (Lee, Chang, Lee, SIGGRAPH 2022).

@@ -1,6 +1,6 @@
 """`python -m dcc_jax.train`: trains a policy; `--help` lists every option.
 
-The loop itself is in `dcc_jax.training`. This file imports nothing heavy before
+The loop itself is in `dcc_jax.training.loop`. This file imports nothing heavy before
 `runtime.setup()` has told JAX how many devices there are.
 """
 
@@ -13,12 +13,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dcc_jax import command, curves, runtime
+from dcc_jax import command, runtime
+from dcc_jax.training import curves
 
 if TYPE_CHECKING:
     from dcc_jax.config import Config
     from dcc_jax.learn.rollout import Environment
-    from dcc_jax.training import TrainResult
+    from dcc_jax.training.loop import TrainResult
 
 PROGRAM = "dcc_jax.train"
 
@@ -31,10 +32,10 @@ def train(
     environment: Environment | None = None,
     quiet: bool = False,
 ) -> TrainResult:
-    """Trains a policy; `dcc_jax.training.train` says what the arguments are."""
-    from dcc_jax import training
+    """Trains a policy; `dcc_jax.training.loop.train` says what the arguments are."""
+    from dcc_jax.training import loop
 
-    return training.train(
+    return loop.train(
         config, run_dir=run_dir, resume=resume, environment=environment, quiet=quiet
     )
 
@@ -44,18 +45,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         if "jax" not in sys.modules:
             runtime.setup()
-        from dcc_jax import options, training
+        from dcc_jax import options
+        from dcc_jax.training import loop
 
         said = options.parse(sys.argv[1:] if argv is None else argv)
-        run = training.prepare(said.config, said.run_dir, said.resume)
+        run = loop.prepare(said.config, said.run_dir, said.resume)
     # OSError: a run directory that cannot be made, a clip that cannot be opened.
     except (ValueError, OSError) as error:
         return command.complain(PROGRAM, str(error), 2)
     try:
-        result = training.execute(run)
+        result = loop.execute(run)
         if result.metrics:
             curves.draw([result.run_dir], result.run_dir / "curves.png")
-    except training.RunError as error:
+    except loop.RunError as error:
         return command.complain(PROGRAM, str(error), 1)
     except KeyboardInterrupt:
         return command.complain(

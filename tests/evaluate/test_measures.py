@@ -7,7 +7,7 @@ import pytest
 
 from dcc_jax.evaluate import measures
 from dcc_jax.evaluate.measures import DT
-from dcc_jax.evaluate.recording import Recording
+from dcc_jax.play.recording import Recording
 
 ZERO = (
     *("force_peak", "impulse", "contact_share", "torque_rms", "contact_torque"),

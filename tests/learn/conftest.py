@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import pytest
+
 from toy_learner import Compiled, compiled_toy
 
 

@@ -6,9 +6,10 @@ import pytest
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 from jax.sharding import NamedSharding, PartitionSpec
 
-from dcc_jax import config, tasks
+from dcc_jax import config
 from dcc_jax.learn import learner
-from dcc_jax.learn.exchange import gathered
+from dcc_jax.learn.exchange import all_gather_tree
+from dcc_jax.training import loop
 
 EXCHANGES = {"psum", "psum_invariant", "all_gather", "pmax", "pmin", "ppermute"}
 LOOPS = {"scan", "while"}
@@ -55,7 +56,7 @@ def _unordered(jaxpr: Jaxpr) -> list[str]:
 @pytest.mark.parametrize("task", ["push", "door"])  # imitates, and follows in time
 def test_programs_leave_no_exchange_beside_a_loop_with_exchanges(task):
     run = config.make_config(task, "smoke")
-    environment = tasks.make_environment(run)
+    environment = loop.make_environment(run)
     mesh = learner.make_mesh(run.train)
     init = learner.make_init(environment, run, mesh)
     key = jax.random.key(0)
@@ -93,7 +94,7 @@ def test_gathered_keeps_structure_and_types_and_the_order_of_devices():
 
     def here(x):
         mine = {"index": jax.lax.axis_index("env"), "x": x}
-        return jax.tree.map(lambda leaf: leaf[None], gathered(mine, "env"))
+        return jax.tree.map(lambda leaf: leaf[None], all_gather_tree(mine, "env"))
 
     program, x = _over_devices(here, jnp.arange(3.0 * devices))
     of_all = jax.jit(program)(x)

@@ -5,11 +5,11 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from toy import ToyConfig
 
 from dcc_jax.learn import learner
 from dcc_jax.learn.ppo import PpoConfig
 from dcc_jax.learn.state import TrainConfig
+from toy import ToyConfig
 
 
 def _rewards(compiled, seed: int, updates: int) -> list[float]:

@@ -52,7 +52,7 @@ def test_first_adam_step_has_the_length_of_the_rate():
     network, optimizer = _network()
     slope = networks.Layer(jnp.array([[0.3], [-0.4]]), jnp.array([0.0]))
     gradient = networks.Mlp((slope,))
-    after, skipped = networks.descend(network, gradient, 0.01, optimizer)
+    after, skipped = networks.apply_gradients(network, gradient, 0.01, optimizer)
     assert skipped == 0.0
     step = after.params.layers[0].kernel - network.params.layers[0].kernel
     np.testing.assert_allclose(step[:, 0], [-0.01, 0.01], rtol=1e-3)
@@ -63,7 +63,7 @@ def test_gradient_that_is_not_finite_changes_nothing_and_is_counted():
     for bad in (jnp.nan, jnp.inf):
         slope = networks.Layer(jnp.array([[1.0], [bad]]), jnp.array([1.0]))
         gradient = networks.Mlp((slope,))
-        after, skipped = networks.descend(network, gradient, 0.01, optimizer)
+        after, skipped = networks.apply_gradients(network, gradient, 0.01, optimizer)
         assert skipped == 1.0
         same = jax.tree.map(lambda a, b: bool(jnp.all(a == b)), after, network)
         assert all(jax.tree.leaves(same))

@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toy import Toy
 
 from dcc_jax.learn import networks, normalizer, ppo, rollout
+from toy import Toy
 
 ENVS, STEPS = 8, 30
 CONFIG = ppo.PpoConfig(hidden=(8,), sigma_degrees=20.0)

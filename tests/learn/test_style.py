@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from toy import Toy
 
 from dcc_jax.env.pairs import COLUMN_ARM, VELOCITY_TIME, pair_coordinates
 from dcc_jax.learn import style
+from toy import Toy
 
 DT = 1.0 / 30.0
 

@@ -6,16 +6,11 @@ from inverse import effort
 from scipy.spatial.transform import Rotation
 
 from dcc_jax.character import asset_path, load_character
-from dcc_jax.motion import author_door
-from dcc_jax.motion.author import RECIPES, author, clip_names
-from dcc_jax.motion.author_kinematics import (
-    GRAVITY,
-    Pose,
-    angular_velocity,
-    momentum,
-)
-from dcc_jax.motion.author_steps import SOLE_RADIUS, sole_spheres
 from dcc_jax.motion.clip import load_clip, save_clip, velocities
+from tools.author_clips import door
+from tools.author_clips.kinematics import GRAVITY, Pose, angular_velocity, momentum
+from tools.author_clips.recipes import RECIPES, author, clip_names
+from tools.author_clips.steps import SOLE_RADIUS, sole_spheres
 
 FEET = (11, 14)  # bodies
 RIGHT_HAND = 8
@@ -233,10 +228,10 @@ def test_hand_stays_on_the_knob_of_a_closed_to_open_door(motions):
         "tij,j->ti", motion.frames[:, RIGHT_HAND], [0.0, -0.085, 0.0]
     )
     t = np.arange(len(palm)) * DT
-    held = (t >= author_door.GRASP_TIME) & (t <= author_door.RELEASE_TIME)
-    error = np.linalg.norm(palm - author_door.knob_path(t), axis=-1)
+    held = (t >= door.GRASP_TIME) & (t <= door.RELEASE_TIME)
+    error = np.linalg.norm(palm - door.knob_path(t), axis=-1)
     assert error[held].max() < 2e-3
-    arm = palm[held, :2] - author_door.HINGE
+    arm = palm[held, :2] - door.HINGE
     np.testing.assert_allclose(np.linalg.norm(arm, axis=-1), 1.0, atol=2e-3)
     assert np.arctan2(arm[-1, 0], arm[-1, 1]) > 0.7  # the paper's target door angle
     assert motion.clip.duration == pytest.approx(5.0)

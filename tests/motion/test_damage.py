@@ -16,10 +16,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from dcc_jax.motion import importer
 from dcc_jax.motion.__main__ import main
-from dcc_jax.motion.importer import Options
-from dcc_jax.motion.npz import MotionError
+from dcc_jax.motion.formats.npz import MotionError
+from dcc_jax.motion.retarget import importer
+from dcc_jax.motion.retarget.importer import Options
 
 
 def run(capsys, *arguments: object) -> tuple[int, str, str]:
@@ -360,5 +360,7 @@ def test_every_truncation_is_survived(tmp_path, monkeypatch, name):
 
 
 def test_importers_need_no_jax():
-    code = "import sys, dcc_jax.motion.importer; sys.exit('jax' in sys.modules)"
+    code = (
+        "import sys, dcc_jax.motion.retarget.importer; sys.exit('jax' in sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

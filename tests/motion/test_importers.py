@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dcc_jax.motion import asf_amc, retarget
-from dcc_jax.motion.bvh import read_bvh
-from dcc_jax.motion.deepmimic import read_deepmimic
-from dcc_jax.motion.figure import figure, world_of
+from dcc_jax.motion.formats import asf_amc
+from dcc_jax.motion.formats.bvh import read_bvh
+from dcc_jax.motion.formats.deepmimic import read_deepmimic
+from dcc_jax.motion.formats.npz import MotionError
+from dcc_jax.motion.formats.skeleton import CMU_UNIT, Motion
 from dcc_jax.motion.frames import to_rotation
-from dcc_jax.motion.importer import Options, import_motion, read_motion
-from dcc_jax.motion.npz import MotionError
-from dcc_jax.motion.skeleton import CMU_UNIT, Motion
+from dcc_jax.motion.retarget.figure import figure, world_of
+from dcc_jax.motion.retarget.importer import Options, import_motion, read_motion
+from dcc_jax.motion.retarget.retarget import retarget
 
 real = pytest.mark.skipif(not files.MOTIONS.is_dir(), reason="no motion data here")
 CMU, HDM = files.MOTIONS / "cmu_asfamc", files.MOTIONS / "hdm05_asfamc"

@@ -9,13 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dcc_jax import physics, tasks
+from dcc_jax import physics
 from dcc_jax.character import asset_path, compose_scene, load_character
 from dcc_jax.config import make_config
 from dcc_jax.motion.clip import load_clip
 from dcc_jax.motion.reference import CONTROL_DT, make_references
 from dcc_jax.tasks.backflip import Backflip
 from dcc_jax.tasks.trampoline import Trampoline
+from dcc_jax.training import loop
 
 TASK = Trampoline()
 SUBSTEPS = 8
@@ -140,7 +141,7 @@ def test_clips_are_files_or_names_of_the_packages_own():
     config = make_config("trampoline", "smoke")
     path = str(asset_path("motions/jump_high.npz"))
     env = dataclasses.replace(config.env, clips=("stand", path, "backflip"))
-    environment = tasks.make_environment(dataclasses.replace(config, env=env))
+    environment = loop.make_environment(dataclasses.replace(config, env=env))
     frames = [
         len(load_clip(asset_path(f"motions/{n}.npz")).qpos)
         for n in ("stand", "jump_high", "backflip")
@@ -151,4 +152,4 @@ def test_clips_are_files_or_names_of_the_packages_own():
     assert lowest < 0.55 and environment.fall_height == pytest.approx(lowest - 0.1)
     env = dataclasses.replace(config.env, clips=("handstand",))
     with pytest.raises(FileNotFoundError, match="handstand"):
-        tasks.make_environment(dataclasses.replace(config, env=env))
+        loop.make_environment(dataclasses.replace(config, env=env))

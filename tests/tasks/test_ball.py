@@ -151,7 +151,7 @@ def test_a_push_changes_the_balls_velocity_and_not_the_pivots(environment):
         key, again = jax.random.split(jax.random.key(seed))
         for start, keep in ((body, False), (upright, True)):
             state, pushed = TASK.control_step(
-                jax.random.clone(key), scene, ball.State(jnp.asarray(-0.01)), start
+                jax.random.clone(key), scene, ball.BallState(jnp.asarray(-0.01)), start
             )
             before, after = (
                 [ball._along_pole(scene, b, h)[1] for h in (0.0, TASK.pole_length)]
@@ -164,7 +164,7 @@ def test_a_push_changes_the_balls_velocity_and_not_the_pivots(environment):
                 assert abs(change[2]) < 1e-6, "the push is horizontal"
                 speeds.append(np.linalg.norm(change))
             assert float(state.next_push) > TASK.interval - 0.1
-        waiting = ball.State(jnp.asarray(0.5))
+        waiting = ball.BallState(jnp.asarray(0.5))
         _, rest = TASK.control_step(again, scene, waiting, body)
         np.testing.assert_array_equal(rest.qvel, body.qvel)
     low, high = TASK.push

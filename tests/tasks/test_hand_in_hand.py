@@ -14,14 +14,10 @@ import pytest
 
 from dcc_jax import physics, quat
 from dcc_jax.character import asset_path, compose_scene, load_character
+from dcc_jax.motion import paths
 from dcc_jax.motion.clip import load_clip
-from dcc_jax.motion.reference import (
-    CONTROL_DT,
-    References,
-    RefState,
-    make_references,
-)
-from dcc_jax.tasks import hand_in_hand, partner
+from dcc_jax.motion.reference import CONTROL_DT, References, RefState, make_references
+from dcc_jax.tasks import hand_in_hand
 from dcc_jax.tasks.hand_in_hand import HandInHand
 
 TASK = HandInHand()
@@ -101,20 +97,20 @@ def pull(scene, reference):
 
 
 @pytest.fixture(scope="module")
-def paths():
+def walked():
     """Positions, headings, speeds at the control steps of PARTNERS partners."""
     velocity = jnp.array([3.0, 0.0])
 
     @jax.vmap
     def begin(key):
-        return partner.begin(
+        return paths.begin(
             key, TASK.gaits, jnp.zeros(2), velocity, facing=jnp.zeros(())
         )
 
     @jax.vmap
     def go_on(key, motion):
-        motion = partner.go_on(key, TASK.gaits, motion)
-        return motion, partner.path(motion, motion.time + CONTROL_DT)
+        motion = paths.go_on(key, TASK.gaits, motion)
+        return motion, paths.path(motion, motion.time + CONTROL_DT)
 
     @jax.jit
     def walk(first, keys):
@@ -132,8 +128,8 @@ def paths():
     return jax.tree.map(lambda x: np.moveaxis(np.array(x), 0, 1), by_partner)
 
 
-def test_a_partner_goes_on_where_the_last_control_step_ended(paths):
-    motions, position, heading, speed = paths
+def test_a_partner_goes_on_where_the_last_control_step_ended(walked):
+    motions, position, heading, speed = walked
     np.testing.assert_allclose(motions.position[:, 1:], position[:, :-1], atol=1e-5)
     np.testing.assert_allclose(motions.heading[:, 1:], heading[:, :-1], atol=1e-5)
     np.testing.assert_allclose(motions.speed[:, 1:], speed[:, :-1], atol=1e-5)
@@ -143,8 +139,8 @@ def test_a_partner_goes_on_where_the_last_control_step_ended(paths):
     np.testing.assert_allclose(motions.speed[:, 0], 3.0, atol=1e-6)
 
 
-def test_a_partners_velocity_is_the_rate_of_its_position(paths):
-    _, position, heading, speed = paths
+def test_a_partners_velocity_is_the_rate_of_its_position(walked):
+    _, position, heading, speed = walked
     moved = np.linalg.norm(np.diff(position, axis=1), axis=-1)
     np.testing.assert_allclose(
         moved, 0.5 * CONTROL_DT * (speed[:, 1:] + speed[:, :-1]), atol=1e-4
@@ -156,8 +152,8 @@ def test_a_partners_velocity_is_the_rate_of_its_position(paths):
     assert np.abs(off[going]).max() < 0.02
 
 
-def test_partners_stand_walk_jog_run_and_turn_within_their_limits(paths):
-    _, _, heading, speed = paths
+def test_partners_stand_walk_jog_run_and_turn_within_their_limits(walked):
+    _, _, heading, speed = walked
     gaits = TASK.gaits
     assert speed.min() > -1e-5 and speed.max() < max(gaits.speeds) + 1e-4
     steady = np.abs(np.diff(speed, axis=1)) < 1e-6
@@ -173,8 +169,8 @@ def test_partners_stand_walk_jog_run_and_turn_within_their_limits(paths):
     assert np.abs(turn[speed[:, 1:] < 1e-3]).max() < 0.3
 
 
-def test_different_keys_give_different_paths(paths):
-    _, position, _, _ = paths
+def test_different_keys_give_different_paths(walked):
+    _, position, _, _ = walked
     ends = position[:, -1]
     gaps = np.linalg.norm(ends[:, None] - ends[None], axis=-1)
     assert np.median(gaps) > 5.0
@@ -230,7 +226,7 @@ def test_the_reference_runs_beside_the_partner(scene, elapsed):
     turning = dataclasses.replace(state.motion, turn=jnp.array(0.5))
     state = dataclasses.replace(state, motion=turning)
     later = TASK.reference(references, state, begins, elapsed)
-    position, heading, speed = partner.path(state.motion, begins.time + elapsed)
+    position, heading, speed = paths.path(state.motion, begins.time + elapsed)
     np.testing.assert_allclose(later.qpos[:2], position, atol=1e-6)
     way = speed * np.array([np.cos(heading), np.sin(heading)])
     np.testing.assert_allclose(later.qvel[:2], way, atol=1e-6)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from dcc_jax.character import asset_path, compose_scene, load_character
+from dcc_jax.motion import planner
 from dcc_jax.motion.clip import load_clip
 from dcc_jax.motion.reference import CONTROL_DT, References, make_references
-from dcc_jax.tasks import strides
 from dcc_jax.tasks.hand_in_hand import HandInHand
 
 PHASES = np.arange(48) / 48
@@ -29,8 +29,8 @@ def references() -> References:
 
 
 @pytest.fixture(scope="module")
-def loops(references) -> strides.Strides:
-    return strides.strides(references)
+def loops(references) -> planner.Strides:
+    return planner.strides(references)
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +89,7 @@ def test_strides_grow_with_speed(references, pose):
 
 @pytest.mark.parametrize("speed", [0.0, 1.0, 2.6])
 def test_what_it_begins_with_moves_as_it_says(references, loops, speed):
-    state = strides.begin(
+    state = planner.begin(
         references, loops, jnp.array(0.3), jnp.array(speed), CONTROL_DT
     )
     np.testing.assert_allclose(state.qpos[:2], 0.0)
@@ -117,4 +117,4 @@ def test_what_it_begins_with_moves_as_it_says(references, loops, speed):
 )
 def test_clips_that_make_no_planner_are_refused(names, reason):
     with pytest.raises(ValueError, match=reason):
-        strides.strides(_references(*names))
+        planner.strides(_references(*names))

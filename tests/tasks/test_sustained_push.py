@@ -12,10 +12,10 @@ import pytest
 
 from dcc_jax import physics
 from dcc_jax.character import asset_path, load_character
+from dcc_jax.motion import paths
 from dcc_jax.motion.clip import load_clip
 from dcc_jax.motion.reference import CONTROL_DT, make_references, planar_moved
-from dcc_jax.tasks import partner
-from dcc_jax.tasks.sustained_push import State, SustainedPush
+from dcc_jax.tasks.sustained_push import SustainedPush, SustainedPushState
 
 TASK = SustainedPush()
 STEPS, PUSHED = 900, 30
@@ -110,7 +110,7 @@ def test_a_push_accelerates_the_character_by_force_over_mass(
     @jax.vmap
     def pushed(state, target):
         kin = physics.kinematics(scene, state)
-        push = State(None, force, target, jnp.ones(()), jnp.ones(()))
+        push = SustainedPushState(None, force, target, jnp.ones(()), jnp.ones(()))
         return TASK.applied(scene, push, kin, jnp.zeros(())), TASK._place(
             scene, push, kin
         )
@@ -145,12 +145,10 @@ def test_path_stops_and_runs_and_the_reference_keeps_to_it(scene, references):
     speeds, reference = [], first
     for key in jax.random.split(jax.random.key(3), STEPS):
         state, reference = step(key, state, reference)
-        root, heading, speed = partner.path(
-            state.motion, state.motion.time + CONTROL_DT
-        )
+        root, heading, speed = paths.path(state.motion, state.motion.time + CONTROL_DT)
         np.testing.assert_allclose(reference.qpos[:2], root, atol=1e-4)
         np.testing.assert_allclose(
-            reference.qvel[:2], speed * partner.direction(heading), atol=1e-4
+            reference.qvel[:2], speed * paths.direction(heading), atol=1e-4
         )
         speeds.append(float(speed))
     assert min(speeds) < 0.01 and max(speeds) > 2.9

@@ -23,7 +23,7 @@ from dcc_jax.control import compliance, pd
 from dcc_jax.control.compliance import Displacement
 from dcc_jax.env import features, metrics, pairs, rewards
 from dcc_jax.env.config import CONTROL_RATE, EnvConfig
-from dcc_jax.env.state import EnvState, Plan, Substep, contained
+from dcc_jax.env.state import ControlInputs, EnvState, Substep, terminate_on_nonfinite
 from dcc_jax.env.task import Forces, RootTarget, Task
 from dcc_jax.motion.reference import References, RefState
 
@@ -70,14 +70,14 @@ class Environment:
         )
         joints = character.kp > 0.0
         lag = float(np.mean(character.kv[joints] / character.kp[joints]))
-        self.demonstration_lead = 0.5 * self.control_dt + lag
+        self.expert_lead = 0.5 * self.control_dt + lag
         self.action_size = 36 + task.extra_actions
-        phase_size = PHASE_SIZE if task.tracks else 0
+        phase_size = PHASE_SIZE if task.tracks_reference else 0
         self.observation_size = 270 + 36 + 4 + 1 + phase_size + task.state_size
         self.feature_size = 270
         self.condition_size = 0
         self.has_task_reward = task.has_reward
-        self.tracks = task.tracks
+        self.tracks_reference = task.tracks_reference
 
     control_dt = 1.0 / CONTROL_RATE
 
@@ -148,16 +148,18 @@ class Environment:
         end, forces = jax.lax.scan(substep, start, None, length=steps)
         return self.end(state, plan, end), forces
 
-    def begin(self, key: Array, state: EnvState, action: Array) -> tuple[Substep, Plan]:
+    def begin(
+        self, key: Array, state: EnvState, action: Array
+    ) -> tuple[Substep, ControlInputs]:
         """The beginning of a control step."""
         task, body = self.task.control_step(key, self.scene, state.task, state.body)
         reference = self._following(state.reference, task)
         pose = self._target_pose(reference, action)
         sums = metrics.no_sums(state.alpha)
         start = Substep(body, state.displacement, task, state.time, sums)
-        return start, Plan(action, pose, state.alpha, reference)
+        return start, ControlInputs(action, pose, state.alpha, reference)
 
-    def end(self, state: EnvState, plan: Plan, end: Substep) -> EnvState:
+    def end(self, state: EnvState, plan: ControlInputs, end: Substep) -> EnvState:
         """The state after a control step, by that before it and its last substep."""
         new = dataclasses.replace(
             state,
@@ -176,7 +178,7 @@ class Environment:
                 end.displacement.u,
             ),
         )
-        return contained(self._judged(self.observed(new)), state)
+        return terminate_on_nonfinite(self._judged(self.observed(new)), state)
 
     def expert_pairs(self, key: Array, n: int) -> tuple[Array, Array, Array]:
         """(s, s') ~ M: features [n, 270] twice, and the condition [n, 0]."""
@@ -188,7 +190,7 @@ class Environment:
             jnp.zeros((n, 0)),
         )
 
-    def demonstration(self, key: Array) -> tuple[Array, Array]:
+    def expert_action(self, key: Array) -> tuple[Array, Array]:
         """A moment of the clips and what leads on from there: obs [O], action [A].
 
         The action asks for the clip's pose half a control step and kv / kp later: a PD
@@ -196,10 +198,8 @@ class Environment:
         """
         state = self.reset(key)
         at = state.reference
-        ahead = self.task.reference(
-            self.references, state.task, at, self.demonstration_lead
-        )
-        follows = self.task.tracks
+        ahead = self.task.reference(self.references, state.task, at, self.expert_lead)
+        follows = self.task.tracks_reference
         base = self._following(at, state.task).qpos if follows else self.nominal
         _, wanted = self.kinematics.coords.split_q(ahead.qpos)
         _, offered = self.kinematics.coords.split_q(base)
@@ -215,7 +215,7 @@ class Environment:
         clip_key, place_key = jax.random.split(key)
         begin = not self.config.random_start
         reference = self.task.first_reference(clip_key, self.references, begin)
-        if not self.task.tracks:
+        if not self.task.tracks_reference:
             reference = _at_origin(reference)
             return reference, reference
         radius = self.task.start_radius
@@ -224,7 +224,7 @@ class Environment:
 
     def _following(self, reference: RefState, task: Any) -> RefState:
         """The reference a control step later, where it is followed in time."""
-        if not self.task.tracks:
+        if not self.task.tracks_reference:
             return reference
         return self.task.reference(self.references, task, reference, self.control_dt)
 
@@ -237,7 +237,7 @@ class Environment:
             return jnp.asarray(low)
         return jax.random.uniform(key, minval=low, maxval=high)
 
-    def _substep(self, carry: Substep, plan: Plan) -> tuple[Substep, Forces]:
+    def _substep(self, carry: Substep, plan: ControlInputs) -> tuple[Substep, Forces]:
         scene, task = self.scene, self.task
         world = task.world(scene, carry.task, carry.time)
         kin = physics.kinematics(scene, carry.body, world)
@@ -250,7 +250,7 @@ class Environment:
     def react(
         self,
         carry: Substep,
-        plan: Plan,
+        plan: ControlInputs,
         kin: physics.Kinematics,
         tau: Array,
         solution: physics.Solution,
@@ -289,12 +289,12 @@ class Environment:
 
     def _target_pose(self, reference: RefState, action: Array) -> Array:
         """What the policy asks for [55]: a (+) from the clip's pose or the nominal."""
-        pose = reference.qpos if self.task.tracks else self.nominal
+        pose = reference.qpos if self.task.tracks_reference else self.nominal
         tangent = jnp.concatenate([jnp.zeros(6, action.dtype), action[:36]])
         coords = self.kinematics.coords
         return quat.oplus(coords, pose, quat.exp_map(coords, tangent))
 
-    def torque(self, carry: Substep, plan: Plan) -> Array:
+    def torque(self, carry: Substep, plan: ControlInputs) -> Array:
         """Stable PD torques [42], N m, towards the pose asked for (+) u."""
         scene, target = self.scene, plan.pose
         if self.config.displace_target:
@@ -373,14 +373,14 @@ class Environment:
 
         As it is, and as a point of the circle, where a stride's end is its beginning.
         """
-        if not self.task.tracks:
+        if not self.task.tracks_reference:
             return jnp.zeros(0)
         phase = state.reference.phase
         turn = 2.0 * jnp.pi * phase
         return jnp.stack([phase, jnp.cos(turn), jnp.sin(turn)])
 
     def _root_target(self, state: EnvState) -> RootTarget:
-        if self.task.tracks:
+        if self.task.tracks_reference:
             return RootTarget(state.reference.qpos[:2], state.reference.qvel[:2])
         return self.task.root_target(self.scene, state.task, state.start, state.time)
 
@@ -414,7 +414,7 @@ class Environment:
 
     def _tracking(self, state: EnvState, q: Array) -> Array:
         """How well q (-) u follows the clip in time, where it does."""
-        if not self.task.tracks:
+        if not self.task.tracks_reference:
             return jnp.zeros(())
         coords = self.kinematics.coords
         _, here = coords.split_q(quat.ominus(coords, q, state.displacement.u))
@@ -425,7 +425,7 @@ class Environment:
     def _over(self, state: EnvState) -> Array:
         """Whether the time is up, or the clip that is followed at its end."""
         late = state.time >= self.config.episode_seconds - 1e-4
-        if not self.task.tracks:
+        if not self.task.tracks_reference:
             return late
         at = state.reference
         ended = at.time >= self.references.duration[at.clip] - 1e-4

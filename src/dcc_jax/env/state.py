@@ -45,7 +45,7 @@ class EnvState:
 
 
 @flax.struct.dataclass
-class Plan:
+class ControlInputs:
     """What stays the same in the physics steps of one control step."""
 
     action: Array  # [A]
@@ -65,7 +65,7 @@ class Substep:
     sums: Sums
 
 
-def contained(new: EnvState, old: EnvState) -> EnvState:
+def terminate_on_nonfinite(new: EnvState, old: EnvState) -> EnvState:
     """`new`, or where a number of it is not finite, `old` as a terminated state."""
     leaves = [x for x in jax.tree.leaves(new) if jnp.issubdtype(x.dtype, jnp.inexact)]
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in leaves]))

@@ -54,7 +54,7 @@ class Task:
     clips: ClassVar[tuple[str, ...]] = ("stand",)
     """Assets in `assets/motions` that a fresh install trains on."""
     has_reward: ClassVar[bool] = False
-    tracks: ClassVar[bool] = False
+    tracks_reference: ClassVar[bool] = False
     """Whether the reference is followed in time (Sec. 5.4 and Appendix): its phase is
     observed, actions are offsets from its pose, a tracking reward replaces the
     discriminator's, and the world is the one that `reference` moves in."""
@@ -65,7 +65,7 @@ class Task:
     clock: ClassVar[str | None] = None
     """The entry of `evaluate`, in s since an event (a throw, a landing), over which an
     evaluation draws its curves; None: over the time since the reset."""
-    settings: ClassVar[Mapping[str, Any]] = {}
+    config_overrides: ClassVar[Mapping[str, Any]] = {}
     """What it learns with, by dotted name as on the command line, where the presets
     `cpu` and `gpu` would say otherwise: `{"ppo.sigma_degrees": 3.0}`."""
     camera_azimuth: ClassVar[float] = 130.0

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from dcc_jax import command
 
 if TYPE_CHECKING:
-    from dcc_jax.evaluate.report import Plan
+    from dcc_jax.evaluate.report import EvaluationPlan
 
 PROGRAM = "dcc_jax.evaluate"
 _DESCRIPTION = """Plays episodes of a trained policy's mean action and measures them.
@@ -48,7 +48,7 @@ def _parser() -> command.Parser:
     return parser
 
 
-def _plan(options: argparse.Namespace) -> Plan:
+def _plan(options: argparse.Namespace) -> EvaluationPlan:
     from dcc_jax.evaluate import report, show
 
     if options.figure is not None:
@@ -67,7 +67,7 @@ def _plan(options: argparse.Namespace) -> Plan:
     )
 
 
-def _run(plan: Plan, options: argparse.Namespace) -> None:
+def _run(plan: EvaluationPlan, options: argparse.Namespace) -> None:
     from rich.console import Console
     from rich.progress import Progress
 

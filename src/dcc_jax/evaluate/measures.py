@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from dcc_jax.env.config import CONTROL_RATE
-from dcc_jax.evaluate.recording import Recording
+from dcc_jax.play.recording import Recording
 
 DT = 1.0 / CONTROL_RATE
 BIN = 3  # control steps in a point of a curve

@@ -21,10 +21,10 @@ from dcc_jax.env.task import Task
 from dcc_jax.evaluate import bootstrap, compare, measures
 from dcc_jax.evaluate.bootstrap import Interval
 from dcc_jax.evaluate.compare import Comparison, Condition, Part
-from dcc_jax.evaluate.episodes import Player
-from dcc_jax.evaluate.recording import Recording
-from dcc_jax.evaluate.runs import Run, find_run, make_environment
 from dcc_jax.learn import style
+from dcc_jax.play.player import Player
+from dcc_jax.play.recording import Recording
+from dcc_jax.play.runs import Run, find_run, make_environment
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def evaluate(
 
 
 @dataclass(frozen=True)
-class Plan:
+class EvaluationPlan:
     """An evaluation that is about to begin: its input is checked."""
 
     conditions: list[tuple[Run, float]]
@@ -100,12 +100,12 @@ def prepare(
     seconds: float | None,
     task: Task | None,
     say: Callable[[str], None],
-) -> Plan:
+) -> EvaluationPlan:
     """Checks everything a user can get wrong; arguments as of `evaluate`."""
     names = [run_dir] if isinstance(run_dir, str | Path) else list(run_dir)
     runs = [find_run(name) for name in names]
     _check(runs, episodes, alpha, seed, seconds)
-    return Plan(
+    return EvaluationPlan(
         conditions=[(run, level) for run in runs for level in _levels(run, alpha, say)],
         players=_players(runs, task),
         episodes=episodes,
@@ -114,7 +114,7 @@ def prepare(
     )
 
 
-def execute(plan: Plan, progress: Callable[[int, int], None]) -> Report:
+def execute(plan: EvaluationPlan, progress: Callable[[int, int], None]) -> Report:
     """Plays and measures."""
     steps = round(plan.seconds * CONTROL_RATE) * plan.episodes
     total = steps * len(plan.conditions)
@@ -217,7 +217,7 @@ def _part(
     )
 
 
-def _report(parts: list[Part], plan: Plan) -> Report:
+def _report(parts: list[Part], plan: EvaluationPlan) -> Report:
     task = plan.players[parts[0].condition.run].environment.task
     resamples = bootstrap.draws(plan.episodes)
     return Report(

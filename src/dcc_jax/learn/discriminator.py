@@ -147,7 +147,7 @@ def update(
         network: networks.Network, batch: tuple[Array, Array]
     ) -> tuple[networks.Network, dict[str, Array]]:
         gradient, metrics = jax.grad(loss, has_aux=True)(network.params, *batch, config)
-        network, skipped = networks.descend(
+        network, skipped = networks.apply_gradients(
             network, gradient, config.learning_rate, optimizer, axis_name
         )
         return network, metrics | {"disc/skipped": skipped}

@@ -20,7 +20,7 @@ from jax.flatten_util import ravel_pytree
 Tree = TypeVar("Tree")
 
 
-def gathered(tree: Tree, axis_name: str) -> Tree:
+def all_gather_tree(tree: Tree, axis_name: str) -> Tree:
     """The values of all devices, leaves [...] -> [D, ...], in a single exchange.
 
     Args:

@@ -97,7 +97,7 @@ def init_network(params: Mlp, optimizer: optax.GradientTransformation) -> Networ
     return Network(params=params, opt_state=optimizer.init(ravel_pytree(params)[0]))
 
 
-def descend(
+def apply_gradients(
     network: Network,
     gradient: Mlp,
     learning_rate: Array | float,

@@ -264,10 +264,10 @@ def _step(
     )
     kl = jax.lax.pmean(of_policy["ppo/kl"], axis_name)
     rate = _adapted(agent.learning_rate, kl, config.target_kl)
-    policy, skipped_policy = networks.descend(
+    policy, skipped_policy = networks.apply_gradients(
         agent.policy, policy_slope, rate, optimizer, axis_name
     )
-    value, skipped_value = networks.descend(
+    value, skipped_value = networks.apply_gradients(
         agent.value, value_slope, config.value_learning_rate, optimizer, axis_name
     )
     skipped = {"ppo/skipped": jnp.maximum(skipped_policy, skipped_value)}

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from dcc_jax.env.rewards import RewardConfig
 from dcc_jax.learn import networks, normalizer, ppo, warm_start
 from dcc_jax.learn.discriminator import DiscriminatorConfig
-from dcc_jax.learn.exchange import gathered
+from dcc_jax.learn.exchange import all_gather_tree
 from dcc_jax.learn.ppo import PpoConfig
 from dcc_jax.learn.rollout import Environment, Incident, Running, reset_all
 
@@ -149,8 +149,8 @@ def init_state(
     )
     if config.train.warm_start_steps:
         keys = jax.random.split(moments_key, config.train.unroll_length * local_envs)
-        obs, _ = jax.vmap(environment.demonstration)(keys)
-    obs_normalizer = normalizer.pooled(gathered(normalizer.moments(obs), AXIS))
+        obs, _ = jax.vmap(environment.expert_action)(keys)
+    obs_normalizer = normalizer.pooled(all_gather_tree(normalizer.moments(obs), AXIS))
     if config.train.warm_start_steps:
         agent = warm_start.warm_start(
             lesson_key,

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from dcc_jax.env import rewards
 from dcc_jax.learn import discriminator, networks, normalizer, ppo
 from dcc_jax.learn.discriminator import Pairs
-from dcc_jax.learn.exchange import gathered
+from dcc_jax.learn.exchange import all_gather_tree
 from dcc_jax.learn.normalizer import Normalizer
 from dcc_jax.learn.ppo import PpoConfig
 from dcc_jax.learn.rollout import (
@@ -70,7 +70,7 @@ def update_state(
     )
     metrics = _env_metrics(taken.env_metrics)
     seen = {"obs": normalizer.moments(_flat(taken.transitions.obs))}
-    if not environment.tracks:
+    if not environment.tracks_reference:
         disc, of_disc, features = _train_discriminator(
             of_device(disc_key), state, taken.transitions.pairs, environment, config
         )
@@ -82,7 +82,7 @@ def update_state(
     agent, of_ppo = ppo.update(of_device(ppo_key), state.agent, batch, config.ppo, AXIS)
     metrics |= of_reward | of_ppo
     episodes = _episodes(taken.transitions)
-    metrics, seen, episodes = gathered((metrics, seen, episodes), AXIS)
+    metrics, seen, episodes = all_gather_tree((metrics, seen, episodes), AXIS)
     metrics = jax.tree.map(lambda x: jnp.mean(x, axis=0), metrics)
     state, of_episodes = _counted(state, episodes)
     state = dataclasses.replace(
@@ -130,7 +130,7 @@ def _rewards(
 ) -> tuple[Array, dict[str, Array]]:
     """Eq. 10, 11 and 13: the reward [T, B], and the means of its parts."""
     weights = config.env.reward
-    if environment.tracks:
+    if environment.tracks_reference:
         r_q = transitions.r_q
     else:
         x = discriminator.inputs(state.feature_normalizer, transitions.pairs)
@@ -165,7 +165,7 @@ def _ppo_batch(
         config.gae_lambda,
     )
     local = normalizer.moments(advantage.reshape(-1))
-    spread = normalizer.pooled(gathered(local, AXIS))
+    spread = normalizer.pooled(all_gather_tree(local, AXIS))
     return ppo.Batch(
         obs=_flat(obs),
         action=_flat(transitions.action),

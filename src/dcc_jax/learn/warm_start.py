@@ -57,11 +57,11 @@ def warm_start(
     def step(policy: networks.Network, at: tuple[Array, Array]):
         key, left = at
         keys = jax.random.split(key, local)
-        obs, action = jax.vmap(environment.demonstration)(keys)
+        obs, action = jax.vmap(environment.expert_action)(keys)
         obs = normalizer.normalize(obs_normalizer, obs)
         slope = jax.grad(loss)(policy.params, obs, action)
         rate = LEARNING_RATE * left
-        return networks.descend(policy, slope, rate, optimizer, axis_name)
+        return networks.apply_gradients(policy, slope, rate, optimizer, axis_name)
 
     left = 1.0 - jnp.arange(steps) / steps
     policy, _ = jax.lax.scan(step, agent.policy, (jax.random.split(key, steps), left))

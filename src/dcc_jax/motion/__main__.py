@@ -10,14 +10,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NoReturn
 
-from dcc_jax.motion import importer
 from dcc_jax.motion.clip import Clip, load_clip, mirrored, save_clip
-from dcc_jax.motion.importer import FORMATS, Options, import_motion
-from dcc_jax.motion.names import read_map
-from dcc_jax.motion.npz import MotionError
-from dcc_jax.motion.quality import measure
-from dcc_jax.motion.retarget import LOW_PASS, Retargeted
-from dcc_jax.motion.skeleton import AXES, UNITS
+from dcc_jax.motion.formats.npz import MotionError
+from dcc_jax.motion.formats.skeleton import AXES, UNITS
+from dcc_jax.motion.retarget import importer
+from dcc_jax.motion.retarget.importer import FORMATS, Options, import_motion
+from dcc_jax.motion.retarget.names import read_map
+from dcc_jax.motion.retarget.quality import measure
+from dcc_jax.motion.retarget.retarget import LOW_PASS, Retargeted
 
 
 class _Parser(argparse.ArgumentParser):

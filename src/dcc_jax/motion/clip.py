@@ -15,6 +15,7 @@ from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
 from dcc_jax.character import Character
+from dcc_jax.motion.formats.npz import MotionError, read_npz, write_npz
 from dcc_jax.motion.frames import (
     continuous,
     join_qpos,
@@ -24,7 +25,6 @@ from dcc_jax.motion.frames import (
     seam_of,
     split_qpos,
 )
-from dcc_jax.motion.npz import MotionError, read_npz, write_npz
 
 __all__ = [
     "Clip",

@@ -15,9 +15,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from dcc_jax import draw
 from dcc_jax.character import FEET, Character, compose_scene, load_character
 from dcc_jax.motion.clip import Clip, velocities
+from dcc_jax.viz import draw
 
 CONTACT_HEIGHT = 0.02  # m, a sole lower than this touches ...
 CONTACT_SPEED = 0.4  # m/s, ... when it is also slower than this

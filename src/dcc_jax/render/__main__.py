@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from dcc_jax import command
 
 if TYPE_CHECKING:
-    from dcc_jax.render.film import Plan
+    from dcc_jax.render.film import FilmPlan
 
 PROGRAM = "dcc_jax.render"
 _DESCRIPTION = """Films a trained policy's mean action. Arrows are the forces that the
@@ -44,13 +44,13 @@ def _parser() -> command.Parser:
     return parser
 
 
-def _plan(options: argparse.Namespace) -> Plan:
+def _plan(options: argparse.Namespace) -> FilmPlan:
     from dcc_jax.render import film
 
     return film.prepare(**vars(options), task=None)
 
 
-def _run(plan: Plan, _: argparse.Namespace) -> None:
+def _run(plan: FilmPlan, _: argparse.Namespace) -> None:
     from rich.console import Console
     from rich.progress import track
 

@@ -14,12 +14,12 @@ import jax
 import numpy as np
 from matplotlib.image import imsave
 
-from dcc_jax import draw
 from dcc_jax.env.config import CONTROL_RATE
 from dcc_jax.env.task import Task
-from dcc_jax.evaluate.episodes import Player
-from dcc_jax.evaluate.recording import Motion, Recording, displaced
-from dcc_jax.evaluate.runs import Run, find_run, make_environment
+from dcc_jax.play.player import Player
+from dcc_jax.play.recording import Motion, Recording, displaced
+from dcc_jax.play.runs import Run, find_run, make_environment
+from dcc_jax.viz import draw
 
 EPISODES = 8  # played at once; the next one begins where one ends by a fall
 AFTERMATH = 6  # frames that a fall is still followed; only soles meet the ground
@@ -29,7 +29,7 @@ SHEET = (4, 3)  # pictures across and down
 
 
 @dataclass(frozen=True)
-class Plan:
+class FilmPlan:
     """A video that is about to be made: its input is checked."""
 
     run: Run
@@ -87,7 +87,7 @@ def prepare(
     seed: int,
     strip: str | Path | None,
     task: Task | None,
-) -> Plan:
+) -> FilmPlan:
     """Checks everything a user can get wrong; arguments as of `render`."""
     if not 0.1 <= seconds <= 3600.0:
         raise ValueError(f"seconds must be in [0.1, 3600], got {seconds}")
@@ -103,7 +103,7 @@ def prepare(
         draw.check_video(out)
     if strip is not None:
         _check_ending("strip", strip, ".png")
-    return Plan(
+    return FilmPlan(
         run=run,
         player=Player(make_environment(run, task)),
         alpha=run.alphas[1] if alpha is None else alpha,
@@ -120,7 +120,7 @@ def _check_ending(name: str, path: str | Path, ending: str) -> None:
     Path(path).parent.mkdir(parents=True, exist_ok=True)
 
 
-def play(plan: Plan) -> Shot:
+def play(plan: FilmPlan) -> Shot:
     """Plays as many episodes as fill the video."""
     recording = plan.player.play(
         plan.run,
@@ -138,7 +138,7 @@ def play(plan: Plan) -> Shot:
     return Shot(images, len(times), int(recording.fell[np.unique(episodes)].sum()))
 
 
-def write(plan: Plan, images: Iterable[np.ndarray]) -> None:
+def write(plan: FilmPlan, images: Iterable[np.ndarray]) -> None:
     """Writes the video and the page of pictures that were asked for."""
     kept: list[np.ndarray] = []
     if plan.out is None:
@@ -182,7 +182,7 @@ def _cut(recording: Recording, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _images(
-    plan: Plan, recording: Recording, times: np.ndarray, episodes: np.ndarray
+    plan: FilmPlan, recording: Recording, times: np.ndarray, episodes: np.ndarray
 ) -> Iterator[np.ndarray]:
     environment = plan.player.environment
     assert recording.motion is not None
@@ -235,7 +235,7 @@ def _arrows(
 
 
 def _captions(
-    plan: Plan, recording: Recording, times: np.ndarray, episodes: np.ndarray
+    plan: FilmPlan, recording: Recording, times: np.ndarray, episodes: np.ndarray
 ) -> list[str]:
     numbers = {name: x[times, episodes] for name, x in recording.numbers.items()}
     alive = recording.alive[times, episodes]

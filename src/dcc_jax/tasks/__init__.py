@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from dcc_jax.character import asset_path, load_character
 from dcc_jax.env.config import EnvConfig
@@ -19,9 +18,6 @@ from dcc_jax.tasks.hand_in_hand import HandInHand
 from dcc_jax.tasks.push import Push
 from dcc_jax.tasks.sustained_push import SustainedPush
 from dcc_jax.tasks.trampoline import Trampoline
-
-if TYPE_CHECKING:
-    from dcc_jax.config import Config
 
 TASKS: dict[str, type[Task]] = {
     task.name: task
@@ -49,24 +45,18 @@ def make_task(name: str) -> Task:
     return TASKS[name]()
 
 
-def make_environment(config: Config, task: Task | None = None) -> Environment:
-    """The environment that a configuration describes.
-
-    Args:
-        config: of the run.
-        task: in place of the one that it names, e.g. with other parameters.
+def make_environment(task: Task, config: EnvConfig) -> Environment:
+    """The environment of a task.
 
     Raises:
-        ValueError: an unknown task.
+        ValueError: clips that are missing or do not suit the task.
         MotionError: a clip that cannot be read.
     """
-    task = make_task(config.task) if task is None else task
-    return Environment(
-        task,
-        load_character(config.env.mass),
-        make_references(_clips(task, config.env)),
-        config.env,
-    )
+    try:
+        references = make_references(_clips(task, config))
+    except FileNotFoundError as error:
+        raise ValueError(f"{error}") from None
+    return Environment(task, load_character(config.mass), references, config)
 
 
 def _clips(task: Task, config: EnvConfig) -> list[Clip]:

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from dcc_jax import physics
 from dcc_jax.motion.reference import RefState
-from dcc_jax.tasks.trampoline import State, Trampoline
+from dcc_jax.tasks.trampoline import Trampoline, TrampolineState
 
 Array = jax.Array
 
@@ -28,7 +28,7 @@ class Backflip(Trampoline):
 
     name: ClassVar[str] = "backflip"
     clips: ClassVar[tuple[str, ...]] = ("backflip",)
-    tracks: ClassVar[bool] = True
+    tracks_reference: ClassVar[bool] = True
     start_radius: ClassVar[float] = 0.05
 
     interval: float = 100.0
@@ -42,7 +42,7 @@ class Backflip(Trampoline):
 
     def reset(
         self, key: Array, scene: physics.Scene, reference: RefState
-    ) -> tuple[State, Array, Array]:
+    ) -> tuple[TrampolineState, Array, Array]:
         """The plate at rest; it kicks if the clip's push-off is still to come."""
         plate_key, kick_key = jax.random.split(key)
         state, qpos, qvel = super().reset(plate_key, scene, reference)

@@ -36,7 +36,7 @@ POLE_RADIUS = 0.012  # m
 
 
 @flax.struct.dataclass
-class State:
+class BallState:
     """When the ball is pushed next."""
 
     next_push: Array  # [] s until then
@@ -53,10 +53,10 @@ class Ball(Task):
     name: ClassVar[str] = "ball"
     clips: ClassVar[tuple[str, ...]] = ("stand",)
     has_reward: ClassVar[bool] = True
-    tracks: ClassVar[bool] = True
+    tracks_reference: ClassVar[bool] = True
     extra_actions: ClassVar[int] = 6
     state_size: ClassVar[int] = 12
-    settings: ClassVar[Mapping[str, Any]] = {
+    config_overrides: ClassVar[Mapping[str, Any]] = {
         "ppo.sigma_degrees": 3.0,
         "train.warm_start_steps": 0,
     }
@@ -136,7 +136,7 @@ class Ball(Task):
 
     def reset(
         self, key: Array, scene: physics.Scene, reference: RefState
-    ) -> tuple[State, Array, Array]:
+    ) -> tuple[BallState, Array, Array]:
         """The pole nearly upright, moving along with the head."""
         lean_key, push_key = jax.random.split(key)
         qpos, qvel = place_character(scene, reference)
@@ -145,7 +145,7 @@ class Ball(Task):
         velocity = 30.0 * (crown - _on_head(reference.qpos_previous, CROWN))
         q_adr, v_adr = _pole(scene)
         pose = jnp.concatenate([crown, quat.exp(jnp.append(lean, 0.0))])
-        state = State(self.interval * jax.random.uniform(push_key))
+        state = BallState(self.interval * jax.random.uniform(push_key))
         return (
             state,
             qpos.at[q_adr : q_adr + 7].set(pose),
@@ -153,14 +153,14 @@ class Ball(Task):
         )
 
     def control_step(
-        self, key: Array, scene: physics.Scene, state: State, body: physics.State
-    ) -> tuple[State, physics.State]:
+        self, key: Array, scene: physics.Scene, state: BallState, body: physics.State
+    ) -> tuple[BallState, physics.State]:
         """Pushes the ball when its time has come."""
         due = state.next_push <= 0.0
         pushed = self._pushed(key, scene, body)
         body = dataclasses.replace(body, qvel=jnp.where(due, pushed, body.qvel))
         waited = jnp.where(due, self.interval, state.next_push)
-        return State(waited - 1.0 / 30.0), body
+        return BallState(waited - 1.0 / 30.0), body
 
     def _pushed(self, key: Array, scene: physics.Scene, body: physics.State) -> Array:
         """Velocities [nv] after an impulse on the ball; the pivot stays as it moves."""
@@ -177,11 +177,11 @@ class Ball(Task):
     def forces(
         self,
         scene: physics.Scene,
-        state: State,
+        state: BallState,
         kin: physics.Kinematics,
         solution: physics.Solution,
         action: Array,
-    ) -> tuple[State, Forces]:
+    ) -> tuple[BallState, Forces]:
         """The fictional forces at head and root, F = 2."""
         head, root = scene.body("head"), scene.body("pelvis")
         heading = quat.heading(kin.body_quat[root])
@@ -196,7 +196,9 @@ class Ball(Task):
             gate=jnp.ones((), bool),
         )
 
-    def observe(self, scene: physics.Scene, state: State, body: physics.State) -> Array:
+    def observe(
+        self, scene: physics.Scene, state: BallState, body: physics.State
+    ) -> Array:
         """Position and velocity of the ball, then of the middle of the pole [12]."""
         origin, heading = features.local_frame(scene.character_qpos(body.qpos))
         to_local = quat.inv(heading)
@@ -206,18 +208,20 @@ class Ball(Task):
             numbers += [position - origin, velocity]
         return quat.rotate(to_local, jnp.stack(numbers)).reshape(-1)
 
-    def reward(self, scene: physics.Scene, state: State, body: physics.State) -> Array:
+    def reward(
+        self, scene: physics.Scene, state: BallState, body: physics.State
+    ) -> Array:
         """r_task = exp(-2 |p_ball - p_head|^2) over the ground."""
         return jnp.exp(-2.0 * jnp.sum(jnp.square(self._offset(scene, body))))
 
     def terminated(
-        self, scene: physics.Scene, state: State, body: physics.State
+        self, scene: physics.Scene, state: BallState, body: physics.State
     ) -> Array:
         """The ball is lost."""
         return _upright(scene, body) < math.cos(self.dropped)
 
     def evaluate(
-        self, scene: physics.Scene, state: State, body: physics.State
+        self, scene: physics.Scene, state: BallState, body: physics.State
     ) -> dict[str, Array]:
         """Offset of the ball from the head over the ground in m, lean in rad."""
         lean = jnp.arccos(jnp.clip(_upright(scene, body), -1.0, 1.0))

@@ -29,9 +29,9 @@ from dcc_jax import physics, quat
 from dcc_jax.character import add_contact
 from dcc_jax.env import features
 from dcc_jax.env.task import Forces, Task, place_character, resultant
+from dcc_jax.motion import paths
+from dcc_jax.motion.paths import Gaits, Motion
 from dcc_jax.motion.reference import CONTROL_DT, References, RefState, planar_moved
-from dcc_jax.tasks import partner
-from dcc_jax.tasks.partner import Gaits, Motion
 
 Array = jax.Array
 
@@ -53,7 +53,7 @@ LONG = 100.0  # s, since a bump that never was
 
 
 @flax.struct.dataclass
-class State:
+class ChickenFightState:
     """The reference's path, the opponent's next attack, and the last bump."""
 
     motion: Motion  # of the reference's root
@@ -71,10 +71,10 @@ class ChickenFight(Task):
 
     name: ClassVar[str] = "chicken-fight"
     clips: ClassVar[tuple[str, ...]] = ("hop_in_place",)
-    tracks: ClassVar[bool] = True
+    tracks_reference: ClassVar[bool] = True
     state_size: ClassVar[int] = 4
     clock: ClassVar[str | None] = "since_bump"
-    settings: ClassVar[Mapping[str, Any]] = {
+    config_overrides: ClassVar[Mapping[str, Any]] = {
         "ppo.sigma_degrees": 3.0,
         "env.fall_height": 0.65,
     }
@@ -122,28 +122,32 @@ class ChickenFight(Task):
             add_contact(spec, "box", target, FRICTION)
 
     def reference(
-        self, references: References, state: State, at: RefState, elapsed: float
+        self,
+        references: References,
+        state: ChickenFightState,
+        at: RefState,
+        elapsed: float,
     ) -> RefState:
         """The clip goes on, its root on its path."""
         later = super().reference(references, state, at, elapsed)
         motion = state.motion
-        position, heading, speed = partner.path(motion, motion.time + elapsed)
+        position, heading, speed = paths.path(motion, motion.time + elapsed)
         turned = planar_moved(later.qpos, state.facing, jnp.zeros(2))
         return dataclasses.replace(
             later,
             qpos=turned.at[:2].set(position),
-            qvel=later.qvel.at[:2].set(speed * partner.direction(heading)),
+            qvel=later.qvel.at[:2].set(speed * paths.direction(heading)),
         )
 
     def reset(
         self, key: Array, scene: physics.Scene, reference: RefState
-    ) -> tuple[State, Array, Array]:
+    ) -> tuple[ChickenFightState, Array, Array]:
         """The box waits out of reach; it comes after a random share of the interval."""
         way_key, motion_key, attack_key = jax.random.split(key, 3)
         way = jax.random.uniform(way_key, minval=-jnp.pi, maxval=jnp.pi)
         root = reference.qpos[:2]
-        state = State(
-            motion=partner.begin(motion_key, self.gaits, root, jnp.zeros(2), way),
+        state = ChickenFightState(
+            motion=paths.begin(motion_key, self.gaits, root, jnp.zeros(2), way),
             facing=jnp.zeros(()),
             next_attack=self.interval * jax.random.uniform(attack_key),
             coming=jnp.zeros((), bool),
@@ -153,12 +157,16 @@ class ChickenFight(Task):
         )
         qpos, qvel = place_character(scene, reference)
         adr, _ = _address(scene, self.opponent)
-        far = root + 2.0 * self.distance * partner.direction(way)
+        far = root + 2.0 * self.distance * paths.direction(way)
         return state, qpos.at[adr : adr + 2].set(far), qvel
 
     def control_step(
-        self, key: Array, scene: physics.Scene, state: State, body: physics.State
-    ) -> tuple[State, physics.State]:
+        self,
+        key: Array,
+        scene: physics.Scene,
+        state: ChickenFightState,
+        body: physics.State,
+    ) -> tuple[ChickenFightState, physics.State]:
         """The reference hops on; the box attacks when its time has come."""
         motion_key, attack_key = jax.random.split(key)
         due = state.next_attack <= 0.0
@@ -168,7 +176,7 @@ class ChickenFight(Task):
         left = jnp.where(due, self.interval, state.next_attack)
         return dataclasses.replace(
             state,
-            motion=partner.go_on(motion_key, self.gaits, state.motion),
+            motion=paths.go_on(motion_key, self.gaits, state.motion),
             next_attack=left - CONTROL_DT,
             coming=due | state.coming,
             impulse=jnp.zeros(3),
@@ -186,7 +194,7 @@ class ChickenFight(Task):
         )
         slow, fast = self.speed
         speed = jax.random.uniform(speed_key, minval=slow, maxval=fast)
-        away = partner.direction(side)
+        away = paths.direction(side)
         across = jnp.stack([-away[1], away[0]])
         root = scene.character_qpos(body.qpos)[:2]
         place = jnp.append(root + self.distance * away + aim * across, side)
@@ -199,7 +207,7 @@ class ChickenFight(Task):
         )
 
     def _retreat(
-        self, scene: physics.Scene, state: State, body: physics.State
+        self, scene: physics.Scene, state: ChickenFightState, body: physics.State
     ) -> physics.State:
         """The box brakes a while after it has bumped, so that it does not lean on."""
         lets_go = ~state.coming & (state.since_bump > self.let_go)
@@ -211,11 +219,11 @@ class ChickenFight(Task):
     def forces(
         self,
         scene: physics.Scene,
-        state: State,
+        state: ChickenFightState,
         kin: physics.Kinematics,
         solution: physics.Solution,
         action: Array,
-    ) -> tuple[State, Forces]:
+    ) -> tuple[ChickenFightState, Forces]:
         """The contacts of the opponent, one resultant a body, F = 4."""
         bodies = [scene.body(self.prefix + name) for name in BODIES]
         sums = [self._bump(scene, solution, body) for body in bodies]
@@ -246,7 +254,9 @@ class ChickenFight(Task):
         force = jnp.asarray(sign)[:, None] * solution.contact_force_w[slots]
         return resultant(force, solution.contact_point_w[slots])
 
-    def observe(self, scene: physics.Scene, state: State, body: physics.State) -> Array:
+    def observe(
+        self, scene: physics.Scene, state: ChickenFightState, body: physics.State
+    ) -> Array:
         """Where the opponent is and how it moves [4], relative to the character."""
         q, qd = scene.character_qpos(body.qpos), scene.character_qvel(body.qvel)
         adr, dof = _address(scene, self.opponent)
@@ -257,13 +267,13 @@ class ChickenFight(Task):
         return quat.rotate(quat.inv(facing), seen)[:, :2].reshape(-1)
 
     def evaluate(
-        self, scene: physics.Scene, state: State, body: physics.State
+        self, scene: physics.Scene, state: ChickenFightState, body: physics.State
     ) -> dict[str, Array]:
         """Of a control step: the opponent's impulse (N s) and largest force (N), how
         far the root is from the reference's and the opponent (m), and the time since
         the bump began (s)."""
         q = scene.character_qpos(body.qpos)
-        root, _, _ = partner.path(state.motion, state.motion.time + CONTROL_DT)
+        root, _, _ = paths.path(state.motion, state.motion.time + CONTROL_DT)
         adr, _ = _address(scene, self.opponent)
         return {
             "bump_impulse": _length(state.impulse),

@@ -44,7 +44,7 @@ LARGEST_ANGLE = 2.0  # rad, where a stop ends the swing
 
 
 @flax.struct.dataclass
-class State:
+class DoorState:
     """The grip and the forces in it."""
 
     time: Array  # [] s into the clip
@@ -64,7 +64,7 @@ class Door(Task):
     name: ClassVar[str] = "door"
     clips: ClassVar[tuple[str, ...]] = ("door",)
     has_reward: ClassVar[bool] = True
-    tracks: ClassVar[bool] = True
+    tracks_reference: ClassVar[bool] = True
     start_radius: ClassVar[float] = 0.02
     state_size: ClassVar[int] = 7
     camera_azimuth: ClassVar[float] = 20.0  # the door hides what is behind it
@@ -137,13 +137,13 @@ class Door(Task):
 
     def reset(
         self, key: Array, scene: physics.Scene, reference: RefState
-    ) -> tuple[State, Array, Array]:
+    ) -> tuple[DoorState, Array, Array]:
         """The door as wide open as the moment of the clip has it, hand on knob."""
         qpos, qvel = place_character(scene, reference)
         angle, rate = self._angle_at(reference)
         q_adr, v_adr = _hinge(scene)
         time = reference.time
-        state = State(
+        state = DoorState(
             time=time,
             holding=(time >= GRASP_TIME) & (time < RELEASE_TIME),
             orthogonal=jnp.zeros(()),
@@ -167,8 +167,8 @@ class Door(Task):
         return jnp.maximum(jnp.arctan2(away[0], away[1]), 0.0)
 
     def control_step(
-        self, key: Array, scene: physics.Scene, state: State, body: physics.State
-    ) -> tuple[State, physics.State]:
+        self, key: Array, scene: physics.Scene, state: DoorState, body: physics.State
+    ) -> tuple[DoorState, physics.State]:
         """The clip goes on; the forces are noted anew."""
         zero = jnp.zeros(())
         state = dataclasses.replace(
@@ -176,7 +176,9 @@ class Door(Task):
         )
         return state, body
 
-    def world(self, scene: physics.Scene, state: State, time: Array) -> physics.World:
+    def world(
+        self, scene: physics.Scene, state: DoorState, time: Array
+    ) -> physics.World:
         """Hand and knob are joined while the hand holds."""
         world = physics.default_world(scene)
         return dataclasses.replace(world, equality_active=state.holding[None])
@@ -184,11 +186,11 @@ class Door(Task):
     def forces(
         self,
         scene: physics.Scene,
-        state: State,
+        state: DoorState,
         kin: physics.Kinematics,
         solution: physics.Solution,
         action: Array,
-    ) -> tuple[State, Forces]:
+    ) -> tuple[DoorState, Forces]:
         """What of the knob's force is orthogonal to its path, F = 1."""
         hand, door = scene.body(HAND), scene.body("door")
         palm = _point(kin, hand, PALM)
@@ -213,7 +215,9 @@ class Door(Task):
             gate=state.holding,
         )
 
-    def observe(self, scene: physics.Scene, state: State, body: physics.State) -> Array:
+    def observe(
+        self, scene: physics.Scene, state: DoorState, body: physics.State
+    ) -> Array:
         """Angle, grip, knob in the hand's frame [3], the way through the door [2]."""
         q = scene.character_qpos(body.qpos)
         angle = body.qpos[_hinge(scene)[0]]
@@ -231,13 +235,15 @@ class Door(Task):
             ]
         )
 
-    def reward(self, scene: physics.Scene, state: State, body: physics.State) -> Array:
+    def reward(
+        self, scene: physics.Scene, state: DoorState, body: physics.State
+    ) -> Array:
         """r_task = exp(-1.5 max(0, 0.7 - angle))."""
         angle = body.qpos[_hinge(scene)[0]]
         return jnp.exp(-1.5 * jnp.maximum(0.0, TARGET_ANGLE - angle))
 
     def evaluate(
-        self, scene: physics.Scene, state: State, body: physics.State
+        self, scene: physics.Scene, state: DoorState, body: physics.State
     ) -> dict[str, Array]:
         """Angle in rad, whether that is open; while the hand holds, the forces in N."""
         angle = body.qpos[_hinge(scene)[0]]

@@ -28,9 +28,9 @@ from dcc_jax import physics, quat
 from dcc_jax.character import BODIES, compose_scene, load_character
 from dcc_jax.env import features
 from dcc_jax.env.task import Forces, Task, place_character
+from dcc_jax.motion import paths, planner
+from dcc_jax.motion.paths import Gaits, Motion
 from dcc_jax.motion.reference import CONTROL_DT, References, RefState
-from dcc_jax.tasks import partner, strides
-from dcc_jax.tasks.partner import Gaits, Motion
 
 Array = jax.Array
 
@@ -54,7 +54,7 @@ LEAD = 2.0 * TIME_CONSTANT
 
 
 @flax.struct.dataclass
-class State:
+class HandInHandState:
     """The partner, where the hands were joined, and what the joint bore."""
 
     motion: Motion
@@ -69,8 +69,8 @@ class HandInHand(Task):
     """Stand, walk, jog and run where the partner goes."""
 
     name: ClassVar[str] = "hand-in-hand"
-    clips: ClassVar[tuple[str, ...]] = strides.LOOPS
-    tracks: ClassVar[bool] = True
+    clips: ClassVar[tuple[str, ...]] = planner.LOOPS
+    tracks_reference: ClassVar[bool] = True
     state_size: ClassVar[int] = 8
 
     gaits: Gaits = field(default_factory=Gaits)
@@ -102,26 +102,30 @@ class HandInHand(Task):
         self, key: Array, references: References, begin: bool
     ) -> RefState:
         """Any moment of a stride at one of the partner's speeds; or a stand."""
-        begins = strides.first_reference(key, references, self.gaits, begin)
+        begins = planner.first_reference(key, references, self.gaits, begin)
         return _reaching(references.coords, begins)
 
     def reference(
-        self, references: References, state: State, at: RefState, elapsed: float
+        self,
+        references: References,
+        state: HandInHandState,
+        at: RefState,
+        elapsed: float,
     ) -> RefState:
         """Beside the partner, as it goes."""
-        loops = strides.strides(references)
-        later = strides.go_on(references, loops, state.motion, at, elapsed)
+        loops = planner.strides(references)
+        later = planner.go_on(references, loops, state.motion, at, elapsed)
         return _reaching(references.coords, later)
 
     def reset(
         self, key: Array, scene: physics.Scene, reference: RefState
-    ) -> tuple[State, Array, Array]:
+    ) -> tuple[HandInHandState, Array, Array]:
         """The partner goes as the reference does, its hand where the reference's is."""
         root, before = reference.qpos[:2], reference.qpos_previous[:2]
-        motion = strides.first_motion(key, self.gaits, reference)
-        now = partner.to_path(palm(reference.qpos), root, motion.heading)
-        then = partner.to_path(palm(reference.qpos_previous), before, motion.heading)
-        state = State(
+        motion = planner.first_motion(key, self.gaits, reference)
+        now = paths.to_path(palm(reference.qpos), root, motion.heading)
+        then = paths.to_path(palm(reference.qpos_previous), before, motion.heading)
+        state = HandInHandState(
             motion=motion,
             first_hand=now - jnp.array(NOMINAL_HAND),
             first_drift=(now - then) / CONTROL_DT,
@@ -131,33 +135,39 @@ class HandInHand(Task):
         return state, *place_character(scene, reference)
 
     def control_step(
-        self, key: Array, scene: physics.Scene, state: State, body: physics.State
-    ) -> tuple[State, physics.State]:
+        self,
+        key: Array,
+        scene: physics.Scene,
+        state: HandInHandState,
+        body: physics.State,
+    ) -> tuple[HandInHandState, physics.State]:
         """The partner goes on."""
         return dataclasses.replace(
             state,
-            motion=partner.go_on(key, self.gaits, state.motion),
+            motion=paths.go_on(key, self.gaits, state.motion),
             force_square=jnp.zeros(()),
             force_peak=jnp.zeros(()),
         ), body
 
-    def hand(self, state: State, time: Array) -> tuple[Array, Array]:
+    def hand(self, state: HandInHandState, time: Array) -> tuple[Array, Array]:
         """Position [3] m and velocity [3] m/s of the partner's hand, world."""
 
         def position(time: Array) -> Array:
-            root, heading, speed = partner.path(state.motion, time)
+            root, heading, speed = paths.path(state.motion, time)
             rocking = self.bounce * jnp.minimum(speed / RUN, 1.0)
             offset = jnp.array(NOMINAL_HAND) + _settling(state, time)
             offset = offset.at[2].add(rocking * jnp.sin(CADENCE * time))
-            return partner.from_path(offset, root, heading)
+            return paths.from_path(offset, root, heading)
 
         time = jnp.asarray(time)
         return jax.jvp(position, (time,), (jnp.ones_like(time),))
 
-    def world(self, scene: physics.Scene, state: State, time: Array) -> physics.World:
+    def world(
+        self, scene: physics.Scene, state: HandInHandState, time: Array
+    ) -> physics.World:
         """The partner, its hand `LEAD` s ahead."""
         position, velocity = self.hand(state, time)
-        _, heading, _ = partner.path(state.motion, time)
+        _, heading, _ = paths.path(state.motion, time)
         half = 0.5 * heading
         facing = jnp.stack([jnp.cos(half), 0.0 * half, 0.0 * half, jnp.sin(half)])
         return dataclasses.replace(
@@ -169,11 +179,11 @@ class HandInHand(Task):
     def forces(
         self,
         scene: physics.Scene,
-        state: State,
+        state: HandInHandState,
         kin: physics.Kinematics,
         solution: physics.Solution,
         action: Array,
-    ) -> tuple[State, Forces]:
+    ) -> tuple[HandInHandState, Forces]:
         """The constraint force on the palm, F = 1."""
         hand = scene.body(HAND)
         reach = quat.rotate(kin.body_quat[hand], jnp.array(PALM))
@@ -191,18 +201,20 @@ class HandInHand(Task):
             gate=jnp.ones((), bool),
         )
 
-    def observe(self, scene: physics.Scene, state: State, body: physics.State) -> Array:
+    def observe(
+        self, scene: physics.Scene, state: HandInHandState, body: physics.State
+    ) -> Array:
         """The partner's hand, its velocity [6], and cos and sin of the way it goes."""
         origin, facing = features.local_frame(scene.character_qpos(body.qpos))
-        now = partner.end(state.motion)
+        now = paths.end(state.motion)
         position, velocity = self.hand(state, now)
-        _, heading, _ = partner.path(state.motion, now)
-        ahead = jnp.append(partner.direction(heading), 0.0)
+        _, heading, _ = paths.path(state.motion, now)
+        ahead = jnp.append(paths.direction(heading), 0.0)
         seen = jnp.stack([position - origin, velocity, ahead])
         return quat.rotate(quat.inv(facing), seen).reshape(-1)[:8]
 
     def terminated(
-        self, scene: physics.Scene, state: State, body: physics.State
+        self, scene: physics.Scene, state: HandInHandState, body: physics.State
     ) -> Array:
         """The hands have parted, or the character is dragged along."""
         numbers = self.evaluate(scene, state, body)
@@ -210,18 +222,18 @@ class HandInHand(Task):
         return parted | (numbers["path_distance"] > self.farthest)
 
     def evaluate(
-        self, scene: physics.Scene, state: State, body: physics.State
+        self, scene: physics.Scene, state: HandInHandState, body: physics.State
     ) -> dict[str, Array]:
         """Of a control step: mean square (N^2) and peak (N) of the joint's force, gap
         between the hands and distance to the path (m), speed of the partner (m/s)."""
         q = scene.character_qpos(body.qpos)
-        root, _, speed = partner.path(state.motion, partner.end(state.motion))
-        hand, _ = self.hand(state, partner.end(state.motion))
+        root, _, speed = paths.path(state.motion, paths.end(state.motion))
+        hand, _ = self.hand(state, paths.end(state.motion))
         return {
             "hand_force_square": state.force_square / CONTROL_DT,
             "hand_force_peak": state.force_peak,
-            "hand_gap": partner.length(palm(q) - hand),
-            "path_distance": partner.length(q[:2] - root),
+            "hand_gap": paths.length(palm(q) - hand),
+            "path_distance": paths.length(q[:2] - root),
             "partner_speed": speed,
         }
 
@@ -257,7 +269,7 @@ def _kinematics() -> features.Kinematics:
     return features.Kinematics.of(compose_scene(load_character(), floor=False))
 
 
-def _settling(state: State, time: Array) -> Array:
+def _settling(state: HandInHandState, time: Array) -> Array:
     """What is left of the hands' first offset [3] m: a critically damped return."""
     rate = 1.0 / SETTLING_TIME
     push = state.first_drift + rate * state.first_hand

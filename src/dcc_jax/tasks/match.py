@@ -20,10 +20,15 @@ import mujoco
 from dcc_jax import physics, quat
 from dcc_jax.character import Character, add_contact, compose_scene, sole_names
 from dcc_jax.env.environment import Environment
-from dcc_jax.env.state import EnvState, Plan, Substep
+from dcc_jax.env.state import ControlInputs, EnvState, Substep
+from dcc_jax.motion import paths
 from dcc_jax.motion.reference import CONTROL_DT, References, RefState, planar_moved
-from dcc_jax.tasks import partner
-from dcc_jax.tasks.chicken_fight import FRICTION, TARGETS, ChickenFight, State
+from dcc_jax.tasks.chicken_fight import (
+    FRICTION,
+    TARGETS,
+    ChickenFight,
+    ChickenFightState,
+)
 
 Array = jax.Array
 
@@ -47,7 +52,9 @@ class Fighter(ChickenFight):
         at = super().first_reference(key, references, begin=False)
         return references.state_at(at.clip, EARLY * at.time)
 
-    def aimed(self, scene: physics.Scene, state: State, body: physics.State) -> State:
+    def aimed(
+        self, scene: physics.Scene, state: ChickenFightState, body: physics.State
+    ) -> ChickenFightState:
         """The reference ahead of the root, on its way to the opponent."""
         root = scene.character_qpos(body.qpos)[:2]
         adr = int(scene.model.joint(self.opponent).qposadr[0])
@@ -55,7 +62,7 @@ class Fighter(ChickenFight):
         heading = jnp.arctan2(way[1], way[0])
         motion = dataclasses.replace(
             state.motion,
-            position=root + REACH * partner.direction(heading),
+            position=root + REACH * paths.direction(heading),
             heading=heading,
             speed=jnp.full((), max(self.gaits.speeds)),
             acceleration=jnp.zeros(()),
@@ -64,8 +71,12 @@ class Fighter(ChickenFight):
         return dataclasses.replace(state, motion=motion)
 
     def control_step(
-        self, key: Array, scene: physics.Scene, state: State, body: physics.State
-    ) -> tuple[State, physics.State]:
+        self,
+        key: Array,
+        scene: physics.Scene,
+        state: ChickenFightState,
+        body: physics.State,
+    ) -> tuple[ChickenFightState, physics.State]:
         """Nothing but the opponent comes at it."""
         state = self.aimed(scene, state, body)
         now = state.motion.time + CONTROL_DT
@@ -162,7 +173,9 @@ class Match:
         )
         return first, second
 
-    def _substep(self, carry: list[Substep], plans: list[Plan]) -> list[Substep]:
+    def _substep(
+        self, carry: list[Substep], plans: list[ControlInputs]
+    ) -> list[Substep]:
         body = carry[0].body
         kin = physics.kinematics(self.scene, body)
         both = list(zip(self.sides, carry, plans, strict=True))

@@ -33,7 +33,7 @@ AWAY = (0.0, 0.0, -10.0)  # m, from where the ball slides, out of sight
 
 
 @flax.struct.dataclass
-class State:
+class PushState:
     """When the next ball comes."""
 
     next_throw: Array  # [] s until then
@@ -83,20 +83,20 @@ class Push(Task):
 
     def reset(
         self, key: Array, scene: physics.Scene, reference: RefState
-    ) -> tuple[State, Array, Array]:
+    ) -> tuple[PushState, Array, Array]:
         """The first ball comes after a random share of the interval."""
         qpos, qvel = place_character(scene, reference)
-        return State(self.interval * jax.random.uniform(key)), qpos, qvel
+        return PushState(self.interval * jax.random.uniform(key)), qpos, qvel
 
     def control_step(
-        self, key: Array, scene: physics.Scene, state: State, body: physics.State
-    ) -> tuple[State, physics.State]:
+        self, key: Array, scene: physics.Scene, state: PushState, body: physics.State
+    ) -> tuple[PushState, physics.State]:
         """Releases the next ball when its time has come."""
         due = state.next_throw <= 0.0
         thrown = self._thrown(key, scene, body)
         body = jax.tree.map(lambda a, b: jnp.where(due, a, b), thrown, body)
         waited = jnp.where(due, self.interval, state.next_throw)
-        return State(waited - 1.0 / 30.0), body
+        return PushState(waited - 1.0 / 30.0), body
 
     def _thrown(
         self, key: Array, scene: physics.Scene, body: physics.State
@@ -125,11 +125,11 @@ class Push(Task):
     def forces(
         self,
         scene: physics.Scene,
-        state: State,
+        state: PushState,
         kin: physics.Kinematics,
         solution: physics.Solution,
         action: Array,
-    ) -> tuple[State, Forces]:
+    ) -> tuple[PushState, Forces]:
         """The strongest contact of the ball, F = 1."""
         slots, bodies, sign = _ball_contacts(scene)
         force = sign[:, None] * solution.contact_force_w[slots]
@@ -141,12 +141,14 @@ class Push(Task):
             gate=jnp.ones((), bool),
         )
 
-    def observe(self, scene: physics.Scene, state: State, body: physics.State) -> Array:
+    def observe(
+        self, scene: physics.Scene, state: PushState, body: physics.State
+    ) -> Array:
         """Nothing of the ball: a push is felt, not seen. Root velocity, [6]."""
         return scene.character_qvel(body.qvel)[:6]
 
     def evaluate(
-        self, scene: physics.Scene, state: State, body: physics.State
+        self, scene: physics.Scene, state: PushState, body: physics.State
     ) -> dict[str, Array]:
         """`since_throw` s, and `speed` m/s of the root over the ground."""
         return {

@@ -24,15 +24,15 @@ import jax.numpy as jnp
 from dcc_jax import physics, quat
 from dcc_jax.env import features
 from dcc_jax.env.task import Forces, Task, place_character
+from dcc_jax.motion import paths, planner
+from dcc_jax.motion.paths import Gaits, Motion
 from dcc_jax.motion.reference import CONTROL_DT, References, RefState
-from dcc_jax.tasks import partner, strides
-from dcc_jax.tasks.partner import Gaits, Motion
 
 Array = jax.Array
 
 
 @flax.struct.dataclass
-class State:
+class SustainedPushState:
     """Where the character should go, and the push that acts or comes next."""
 
     motion: Motion
@@ -47,8 +47,8 @@ class SustainedPush(Task):
     """Stand, walk or run, whoever pulls."""
 
     name: ClassVar[str] = "sustained-push"
-    clips: ClassVar[tuple[str, ...]] = strides.LOOPS
-    tracks: ClassVar[bool] = True
+    clips: ClassVar[tuple[str, ...]] = planner.LOOPS
+    tracks_reference: ClassVar[bool] = True
     state_size: ClassVar[int] = 6
     clock: ClassVar[str | None] = "since_push"
 
@@ -73,22 +73,26 @@ class SustainedPush(Task):
         self, key: Array, references: References, begin: bool
     ) -> RefState:
         """Any moment of a stride at one of the speeds; or a stand."""
-        return strides.first_reference(key, references, self.gaits, begin)
+        return planner.first_reference(key, references, self.gaits, begin)
 
     def reference(
-        self, references: References, state: State, at: RefState, elapsed: float
+        self,
+        references: References,
+        state: SustainedPushState,
+        at: RefState,
+        elapsed: float,
     ) -> RefState:
         """Along the path."""
-        loops = strides.strides(references)
-        return strides.go_on(references, loops, state.motion, at, elapsed)
+        loops = planner.strides(references)
+        return planner.go_on(references, loops, state.motion, at, elapsed)
 
     def reset(
         self, key: Array, scene: physics.Scene, reference: RefState
-    ) -> tuple[State, Array, Array]:
+    ) -> tuple[SustainedPushState, Array, Array]:
         """It begins in a pause."""
         pause_key, motion_key = jax.random.split(key)
-        state = State(
-            motion=strides.first_motion(motion_key, self.gaits, reference),
+        state = SustainedPushState(
+            motion=planner.first_motion(motion_key, self.gaits, reference),
             force_w=jnp.zeros(3),
             target=jnp.zeros((), jnp.int32),
             left=self.pause[1] * jax.random.uniform(pause_key),
@@ -97,8 +101,12 @@ class SustainedPush(Task):
         return state, *place_character(scene, reference)
 
     def control_step(
-        self, key: Array, scene: physics.Scene, state: State, body: physics.State
-    ) -> tuple[State, physics.State]:
+        self,
+        key: Array,
+        scene: physics.Scene,
+        state: SustainedPushState,
+        body: physics.State,
+    ) -> tuple[SustainedPushState, physics.State]:
         """The path goes on; pushes and pauses take turns."""
         rest_key, push_key, motion_key = jax.random.split(key, 3)
         over = state.left <= 0.0
@@ -109,10 +117,10 @@ class SustainedPush(Task):
             self._pushing(push_key, state),
         )
         state = jax.tree.map(lambda a, b: jnp.where(over, a, b), changed, state)
-        motion = partner.go_on(motion_key, self.gaits, state.motion)
+        motion = paths.go_on(motion_key, self.gaits, state.motion)
         root = scene.character_qpos(body.qpos)[:2]
         away = motion.position - root
-        within = jnp.minimum(1.0, self.leash / partner.length(away))
+        within = jnp.minimum(1.0, self.leash / paths.length(away))
         motion = dataclasses.replace(motion, position=root + within * away)
         return dataclasses.replace(
             state,
@@ -121,12 +129,12 @@ class SustainedPush(Task):
             since=state.since + CONTROL_DT,
         ), body
 
-    def _resting(self, key: Array, state: State) -> State:
+    def _resting(self, key: Array, state: SustainedPushState) -> SustainedPushState:
         shortest, longest = self.pause
         left = jax.random.uniform(key, minval=shortest, maxval=longest)
         return dataclasses.replace(state, force_w=jnp.zeros(3), left=left)
 
-    def _pushing(self, key: Array, state: State) -> State:
+    def _pushing(self, key: Array, state: SustainedPushState) -> SustainedPushState:
         keys = jax.random.split(key, 5)
         way = jax.random.uniform(keys[0], minval=-jnp.pi, maxval=jnp.pi)
         slope = jax.random.uniform(keys[1], minval=-self.slope, maxval=self.slope)
@@ -146,7 +154,11 @@ class SustainedPush(Task):
         )
 
     def applied(
-        self, scene: physics.Scene, state: State, kin: physics.Kinematics, time: Array
+        self,
+        scene: physics.Scene,
+        state: SustainedPushState,
+        kin: physics.Kinematics,
+        time: Array,
     ) -> Array:
         """J^T f at the body's centre of mass."""
         body, point = self._place(scene, state, kin)
@@ -155,11 +167,11 @@ class SustainedPush(Task):
     def forces(
         self,
         scene: physics.Scene,
-        state: State,
+        state: SustainedPushState,
         kin: physics.Kinematics,
         solution: physics.Solution,
         action: Array,
-    ) -> tuple[State, Forces]:
+    ) -> tuple[SustainedPushState, Forces]:
         """The push itself, F = 1."""
         body, point = self._place(scene, state, kin)
         return state, Forces(
@@ -170,33 +182,35 @@ class SustainedPush(Task):
         )
 
     def _place(
-        self, scene: physics.Scene, state: State, kin: physics.Kinematics
+        self, scene: physics.Scene, state: SustainedPushState, kin: physics.Kinematics
     ) -> tuple[Array, Array]:
         """The body pushed [] and its centre of mass [3]."""
         body = jnp.array([scene.body(name) for name in self.bodies])[state.target]
         return body, kin.body_center[body]
 
-    def observe(self, scene: physics.Scene, state: State, body: physics.State) -> Array:
+    def observe(
+        self, scene: physics.Scene, state: SustainedPushState, body: physics.State
+    ) -> Array:
         """The way to the reference's root, its velocity and cos and sin of its path,
         over the ground [6]. The push is felt, not seen."""
         origin, facing = features.local_frame(scene.character_qpos(body.qpos))
-        root, heading, speed = partner.path(state.motion, partner.end(state.motion))
-        ahead = partner.direction(heading)
+        root, heading, speed = paths.path(state.motion, paths.end(state.motion))
+        ahead = paths.direction(heading)
         seen = jnp.stack([root - origin[:2], speed * ahead, ahead])
         level = jnp.pad(seen, ((0, 0), (0, 1)))
         return quat.rotate(quat.inv(facing), level)[:, :2].reshape(-1)
 
     def evaluate(
-        self, scene: physics.Scene, state: State, body: physics.State
+        self, scene: physics.Scene, state: SustainedPushState, body: physics.State
     ) -> dict[str, Array]:
         """The push (N), the speeds of the root and of its path over the ground (m/s),
         the distance between the two (m), and the time since the last push began (s)."""
-        root, _, speed = partner.path(state.motion, partner.end(state.motion))
+        root, _, speed = paths.path(state.motion, paths.end(state.motion))
         q, qd = scene.character_qpos(body.qpos), scene.character_qvel(body.qvel)
         return {
-            "push": partner.length(state.force_w),
-            "speed": partner.length(qd[:2]),
+            "push": paths.length(state.force_w),
+            "speed": paths.length(qd[:2]),
             "path_speed": speed,
-            "path_distance": partner.length(q[:2] - root),
+            "path_distance": paths.length(q[:2] - root),
             "since_push": state.since,
         }

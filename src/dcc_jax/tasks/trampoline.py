@@ -33,7 +33,7 @@ HALF_SIZE, HALF_THICKNESS = 1.5, 0.05  # m
 
 
 @flax.struct.dataclass
-class State:
+class TrampolineState:
     """The bounce schedule and the landing that opens the gate."""
 
     next_bounce: Array  # [] s until the plate kicks; negative while it does
@@ -100,10 +100,10 @@ class Trampoline(Task):
 
     def reset(
         self, key: Array, scene: physics.Scene, reference: RefState
-    ) -> tuple[State, Array, Array]:
+    ) -> tuple[TrampolineState, Array, Array]:
         """The plate at rest; the first bounce after a random share of the interval."""
         qpos, qvel = place_character(scene, reference)
-        state = State(
+        state = TrampolineState(
             next_bounce=self.interval * jax.random.uniform(key),
             airborne=jnp.zeros(()),
             landed=jnp.full((), self.absorb_time),
@@ -113,8 +113,12 @@ class Trampoline(Task):
         return state, qpos, qvel
 
     def control_step(
-        self, key: Array, scene: physics.Scene, state: State, body: physics.State
-    ) -> tuple[State, physics.State]:
+        self,
+        key: Array,
+        scene: physics.Scene,
+        state: TrampolineState,
+        body: physics.State,
+    ) -> tuple[TrampolineState, physics.State]:
         """Counts down to the bounce, and the turns until it stands again.
 
         Who stands has turned by whole turns, but for the lean of the take-off.
@@ -132,7 +136,11 @@ class Trampoline(Task):
         ), body
 
     def applied(
-        self, scene: physics.Scene, state: State, kin: physics.Kinematics, time: Array
+        self,
+        scene: physics.Scene,
+        state: TrampolineState,
+        kin: physics.Kinematics,
+        time: Array,
     ) -> Array:
         """The weights that the springs' rest position carries, and the kick."""
         weight = GRAVITY * float(scene.model.body_mass.sum())
@@ -144,11 +152,11 @@ class Trampoline(Task):
     def forces(
         self,
         scene: physics.Scene,
-        state: State,
+        state: TrampolineState,
         kin: physics.Kinematics,
         solution: physics.Solution,
         action: Array,
-    ) -> tuple[State, Forces]:
+    ) -> tuple[TrampolineState, Forces]:
         """One resultant a foot, F = 2; heard for a while after each landing."""
         feet = [scene.body(name) for name in FEET]
         sums = [_foot_force(scene, solution, foot) for foot in feet]
@@ -167,7 +175,9 @@ class Trampoline(Task):
             gate=state.landed < self.absorb_time,
         )
 
-    def observe(self, scene: physics.Scene, state: State, body: physics.State) -> Array:
+    def observe(
+        self, scene: physics.Scene, state: TrampolineState, body: physics.State
+    ) -> Array:
         """Plate height, tilt and their rates [6]; time to and since events [2]."""
         adr = int(scene.model.joint("plate_z").qposadr[0])
         dof = int(scene.model.joint("plate_z").dofadr[0])
@@ -180,20 +190,20 @@ class Trampoline(Task):
         )
 
     def terminated(
-        self, scene: physics.Scene, state: State, body: physics.State
+        self, scene: physics.Scene, state: TrampolineState, body: physics.State
     ) -> Array:
         """Off the plate."""
         root = scene.character_qpos(body.qpos)[:2]
         return jnp.any(jnp.abs(root) > HALF_SIZE - 0.1)
 
     def ground_height(
-        self, scene: physics.Scene, state: State, body: physics.State
+        self, scene: physics.Scene, state: TrampolineState, body: physics.State
     ) -> Array:
         """Height of the plate's middle."""
         return body.qpos[int(scene.model.joint("plate_z").qposadr[0])]
 
     def evaluate(
-        self, scene: physics.Scene, state: State, body: physics.State
+        self, scene: physics.Scene, state: TrampolineState, body: physics.State
     ) -> dict[str, Array]:
         """`since_bounce` s since the last kick began, `plate_height` m, `in_flight`,
         `turned` rad backwards since it last stood, `flips` that it landed and stood."""

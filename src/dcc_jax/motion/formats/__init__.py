@@ -1,0 +1,1 @@
+"""Files of other programs: each reader returns a skeleton and its motion."""

@@ -1,0 +1,1 @@
+"""From another skeleton's motion to a clip of the character."""

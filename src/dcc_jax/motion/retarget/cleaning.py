@@ -1,0 +1,269 @@
+"""Foot cleaning: the least change after which standing feet neither slide nor sink.
+
+Copying rotations to another body leaves its feet sliding and off the ground. What is
+sought is a correction of the root's path and of both feet, over all frames at once: a
+least-squares problem whose matrix is banded, solved anew about its last solution until
+it is settled (Gauss-Newton, with the inequalities as an active set).
+
+Letters: T frames; 15 unknowns a frame: the root's shift, and shift and turn (a rotation
+vector in the world) of the left and of the right foot.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from dcc_jax.motion.clip import Clip
+from dcc_jax.motion.frames import to_quats, to_rotation
+from dcc_jax.motion.retarget.banded import Equations
+from dcc_jax.motion.retarget.figure import (
+    FEET,
+    HEEL,
+    THIGHS,
+    TOE,
+    Figure,
+    figure,
+    qpos_of,
+    world_of,
+)
+from dcc_jax.motion.retarget.legs import REACH, reach_feet
+
+UNKNOWNS = 15
+ROUNDS = 8
+ROOT, FOOT = slice(0, 3), (slice(3, 9), slice(9, 15))
+# Weights, relative to a correction of 1 m; turns count by their lever of about 0.2 m.
+LEVER = 0.2  # m
+SLIP = 20.0  # s, on the speed of a standing point
+HEIGHT = 100.0  # on the height of a standing point, and on what is below the ground
+STRETCH = 1.0  # on a change of the distance from hip to ankle
+TOO_FAR = 100.0  # on what a leg would be longer than it is
+CLEARANCE = 0.012  # m, of a foot that swings at `SWING[1]` m/s; none at SWING[0]
+SWING = (0.5, 1.5)
+PIVOT = 1.0  # rad/s; a foot that turns faster stands on the slower of heel and toe only
+ROOT_EASE, FOOT_EASE = 0.20, 0.08  # s, over which corrections come and go
+
+
+def clean_feet(clip: Clip, contacts: np.ndarray) -> Clip:
+    """The clip with feet that stand where they are said to.
+
+    Args:
+        clip: on level ground at z = 0.
+        contacts: [T, 2, 2], which part (heel, toe) of which foot stands.
+    """
+    body = figure()
+    world = world_of(clip.qpos)
+    root = clip.qpos[:, :3].astype(float)
+    positions = body.positions(root, world)
+    start = _Pose(root, positions[:, list(THIGHS)], positions[:, list(FEET)], world)
+    now = _settled(body, start, contacts, clip.fps)
+    reached = reach_feet(body, now.root, world, now.ankles, now.feet)
+    return replace(clip, qpos=qpos_of(now.root, reached))
+
+
+def _settled(body: Figure, start: _Pose, contacts: np.ndarray, fps: float) -> _Pose:
+    """The pose after as many corrections as it takes.
+
+    An inequality acts from when it is broken for as long as it pushes, which the last
+    linear solution tells; what the pose itself tells would switch it on and off.
+    """
+    change = np.zeros((len(start.root), UNKNOWNS))
+    standing = np.repeat(contacts, 2, axis=2)
+    fixed = contacts & ~_pivoting(body, start, fps)
+    least = _least_heights(body, start, standing, fps)
+    floored = np.zeros(standing.shape, bool)  # points held up by the ground
+    taut = np.zeros(standing.shape[:2], bool)  # legs held back by their length
+    for _ in range(ROUNDS):
+        now = start.changed(change)
+        low, moves = _heights(body, now)
+        excess, along = _stretches(body, now)
+        floored |= low < least
+        taut |= excess > 0.0
+        equations = Equations(width=2 * UNKNOWNS)
+        _stay_close(equations, change, fps)
+        _hold(equations, low, least, moves, standing | floored)
+        _stop(equations, body, now, fixed, moves, fps)
+        _keep_length(equations, start, now, excess, along, taut)
+        step = equations.solve(change.size).reshape(change.shape)
+        change = change + step
+        feet = np.stack([step[:, part] for part in FOOT], axis=1)
+        floored &= low + np.einsum("tfki,tfi->tfk", moves[..., 2, :], feet) < least
+        apart = feet[..., :3] - step[:, None, ROOT]
+        taut &= excess + np.einsum("tfi,tfi->tf", along, apart) > 0.0
+    return start.changed(change)
+
+
+@dataclass(frozen=True, eq=False)
+class _Pose:
+    """Root [T, 3], hips and ankles [T, 2, 3] in m, and world rotations [T, 13, 4]."""
+
+    root: np.ndarray
+    hips: np.ndarray
+    ankles: np.ndarray
+    world: np.ndarray
+
+    @property
+    def feet(self) -> np.ndarray:
+        """World rotations [T, 2, 4] of the feet."""
+        return self.world[:, list(FEET)]
+
+    def changed(self, change: np.ndarray) -> _Pose:
+        """The pose after the correction [T, 15]; only the feet's rotations change."""
+        shift = change[:, ROOT]
+        world = self.world.copy()
+        ankles = self.ankles.copy()
+        for side, foot in enumerate(FEET):
+            part = change[:, FOOT[side]]
+            ankles[:, side] += part[:, :3]
+            turn = Rotation.from_rotvec(part[:, 3:])
+            world[:, foot] = to_quats(turn * to_rotation(self.world[:, foot]))
+        hips = self.hips + shift[:, None]
+        return _Pose(self.root + shift, hips, ankles, world)
+
+
+def _stay_close(equations: Equations, change: np.ndarray, fps: float) -> None:
+    """The correction is small, and so is its acceleration."""
+    frames = len(change)
+    weight = np.ones(UNKNOWNS)
+    ease = np.full(UNKNOWNS, FOOT_EASE)
+    ease[ROOT] = ROOT_EASE
+    for part in FOOT:
+        weight[part] = [1.0, 1.0, 1.0, LEVER, LEVER, LEVER]
+    index = np.arange(frames * UNKNOWNS)
+    size = np.tile(weight, frames)
+    equations.add(index[:, None], size[:, None], -size * change.ravel())
+    if frames < 3:
+        return
+    middle = index[UNKNOWNS:-UNKNOWNS]
+    columns = np.stack([middle - UNKNOWNS, middle, middle + UNKNOWNS], axis=1)
+    size = np.tile(weight * (ease * fps) ** 2, frames - 2)
+    values = size[:, None] * [1.0, -2.0, 1.0]
+    bend = change[:-2] - 2.0 * change[1:-1] + change[2:]
+    equations.add(columns, values, -size * bend.ravel())
+
+
+def _foot_columns(frames: np.ndarray, side: int) -> np.ndarray:
+    """Unknowns [N, 6] of one foot in some frames."""
+    return frames[:, None] * UNKNOWNS + np.arange(UNKNOWNS)[FOOT[side]]
+
+
+def _lever_matrix(arms: np.ndarray) -> np.ndarray:
+    """[..., 3, 6]: how points at `arms` [..., 3] from the ankle move with the foot."""
+    x, y, z = np.moveaxis(arms, -1, 0)
+    o = np.zeros_like(x)
+    cross = np.stack([o, z, -y, -z, o, x, y, -x, o], axis=-1)
+    cross = cross.reshape(*arms.shape, 3)
+    unit = np.broadcast_to(np.eye(3), cross.shape)
+    return np.concatenate([unit, cross], axis=-1)
+
+
+def _heights(body: Figure, pose: _Pose) -> tuple[np.ndarray, np.ndarray]:
+    """Heights [T, 2, 4] of the points of the soles, and their levers [..., 3, 6]."""
+    centres = body.sole_centres(pose.ankles, pose.feet)
+    moves = _lever_matrix(centres - pose.ankles[:, :, None])
+    return centres[..., 2] - body.radius, moves
+
+
+def _least_heights(
+    body: Figure, pose: _Pose, standing: np.ndarray, fps: float
+) -> np.ndarray:
+    """How high the points of the soles have to be, [T, 2, 4]: swinging ones clear."""
+    centres = body.sole_centres(pose.ankles, pose.feet)
+    speed = np.linalg.norm(np.gradient(centres, 1.0 / fps, axis=0), axis=-1)
+    swing = np.clip((speed - SWING[0]) / (SWING[1] - SWING[0]), 0.0, 1.0)
+    return np.where(standing, 0.0, CLEARANCE * swing)
+
+
+def _stretches(body: Figure, pose: _Pose) -> tuple[np.ndarray, np.ndarray]:
+    """How much too long the legs are [T, 2], and their directions [T, 2, 3]."""
+    leg = pose.ankles - pose.hips
+    length = np.linalg.norm(leg, axis=-1)
+    return length - REACH * sum(body.leg), leg / length[..., None]
+
+
+def _hold(
+    equations: Equations,
+    low: np.ndarray,
+    least: np.ndarray,
+    moves: np.ndarray,
+    held: np.ndarray,
+) -> None:
+    """Standing points are on the ground, and no point is below it."""
+    for side in range(2):
+        for point in range(4):
+            frames = np.flatnonzero(held[:, side, point])
+            wanted = (least - low)[frames, side, point]
+            columns = _foot_columns(frames, side)
+            values = moves[frames, side, point, 2]
+            equations.add(columns, HEIGHT * values, HEIGHT * wanted)
+
+
+def _pivoting(body: Figure, pose: _Pose, fps: float) -> np.ndarray:
+    """Which parts move while the foot turns on its other part, [T, 2, 2]."""
+    out = np.zeros((len(pose.root), 2, 2), bool)
+    centres = body.sole_centres(pose.ankles, pose.feet)
+    parts = centres.reshape(len(centres), 2, 2, 2, 3).mean(axis=3)
+    speed = np.linalg.norm(np.gradient(parts[..., :2], 1.0 / fps, axis=0), axis=-1)
+    for side in range(2):
+        turns = to_rotation(pose.feet[:, side])
+        rate = (turns[1:] * turns[:-1].inv()).as_rotvec()[:, 2] * fps
+        fast = np.abs(np.append(rate, rate[-1])) > PIVOT
+        out[fast, side, speed[fast, side].argmax(axis=1)] = True
+    return out
+
+
+def _stop(
+    equations: Equations,
+    body: Figure,
+    pose: _Pose,
+    fixed: np.ndarray,
+    moves: np.ndarray,
+    fps: float,
+) -> None:
+    """Fixed parts do not slip: their middles stay, so one part alone may turn.
+
+    A sphere that rolls without slipping moves its centre by the turn times its radius.
+    """
+    centres = body.sole_centres(pose.ankles, pose.feet)
+    lift = np.array([0.0, 0.0, body.radius])
+    rolling = _lever_matrix(lift)
+    rolling[:, :3] = 0.0
+    for side in range(2):
+        turns = to_rotation(pose.feet[:, side])
+        rolled = np.cross((turns[1:] * turns[:-1].inv()).as_rotvec(), lift)
+        for part, points in enumerate((HEEL, TOE)):
+            on = fixed[:, side, part]
+            frames = np.flatnonzero(on[1:] & on[:-1])
+            middle = centres[:, side, points].mean(axis=1)
+            lever = moves[:, side, points].mean(axis=1)
+            slip = middle[frames + 1] - middle[frames] - rolled[frames]
+            sides = [rolling - lever[frames], lever[frames + 1] - rolling]
+            values = SLIP * fps * np.concatenate(sides, axis=2)
+            columns = [_foot_columns(frames + late, side) for late in (0, 1)]
+            columns = np.concatenate(columns, axis=1)
+            for axis in range(2):
+                wanted = -SLIP * fps * slip[:, axis]
+                equations.add(columns, values[:, axis], wanted)
+
+
+def _keep_length(
+    equations: Equations,
+    start: _Pose,
+    pose: _Pose,
+    excess: np.ndarray,
+    along: np.ndarray,
+    taut: np.ndarray,
+) -> None:
+    """Legs keep the length from hip to ankle they had, and never exceed their own."""
+    before, now = (np.linalg.norm(p.ankles - p.hips, axis=-1) for p in (start, pose))
+    frames = np.arange(len(now))
+    root = frames[:, None] * UNKNOWNS + np.arange(UNKNOWNS)[ROOT]
+    for side in range(2):
+        columns = np.concatenate([root, _foot_columns(frames, side)[:, :3]], axis=1)
+        values = np.concatenate([-along[:, side], along[:, side]], axis=1)
+        change = STRETCH * (before - now)[:, side]
+        equations.add(columns, STRETCH * values, change)
+        on = taut[:, side]
+        equations.add(columns[on], TOO_FAR * values[on], -TOO_FAR * excess[on, side])

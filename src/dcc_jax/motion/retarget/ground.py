@@ -1,0 +1,128 @@
+"""Where the ground is in a recording, and when the feet stand on it.
+
+Letters: T frames. Contacts are [T, 2 feet, 2 parts], heel and toe.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from scipy.ndimage import median_filter
+from scipy.spatial.transform import Rotation
+
+from dcc_jax.motion.clip import Clip
+from dcc_jax.motion.frames import join_qpos, split_qpos, to_quats, to_rotation
+from dcc_jax.motion.retarget.figure import figure, soles_of
+
+SLOW = 0.3  # m/s, of a point that may be standing
+MAX_SLOPE = 0.05
+MIN_SLOPE = 0.006  # below this a floor counts as level
+MIN_TRAVEL = 1.0  # m, over which a slope can be told
+NEXT_PLACE = 0.3  # m, between stances that count as different places
+# A part touches down below the first height and speed, and leaves above the second.
+HEIGHTS = (0.035, 0.05)  # m
+SPEEDS = (0.35, 0.55)  # m/s
+SHORTEST = 0.06  # s, of a contact, and of a gap in one
+
+
+def on_level_ground(clip: Clip) -> tuple[Clip, float]:
+    """The clip turned and shifted so that its standing feet are at z = 0.
+
+    Returns:
+        The clip, and the slope of the floor that was taken out (rise over run).
+    """
+    stances = _stances(clip)
+    slope, direction = _slope(stances)
+    if slope:
+        axis = np.array([-direction[1], direction[0], 0.0]) * math.atan(slope)
+        clip = _turned(clip, Rotation.from_rotvec(axis))
+        stances = _stances(clip)
+    heights = stances[:, 2]
+    position, quats = split_qpos(clip.qpos)
+    level = position - [0.0, 0.0, float(np.median(heights))]
+    return replace(clip, qpos=join_qpos(level, quats)), slope
+
+
+def _turned(clip: Clip, turn: Rotation) -> Clip:
+    position, quats = split_qpos(clip.qpos)
+    quats = quats.copy()
+    quats[:, 0] = to_quats(turn * to_rotation(quats[:, 0]))
+    return replace(clip, qpos=join_qpos(turn.apply(position), quats))
+
+
+def _stances(clip: Clip) -> np.ndarray:
+    """Where each foot stood, each time it did: points [N, 3], in order of time.
+
+    A stance is a stretch in which the lowest point of the foot is slow and near the
+    lowest such point; its place is the median. Where no foot ever stands it is the
+    lowest point of all.
+    """
+    centres = soles_of(clip.qpos)
+    bottoms = centres - [0.0, 0.0, figure().radius]
+    speed = np.linalg.norm(np.gradient(centres, 1.0 / clip.fps, axis=0), axis=-1)
+    lowest = bottoms[..., 2].argmin(axis=2)[..., None]
+    slow = np.take_along_axis(speed, lowest, axis=2)[..., 0] < SLOW
+    points = np.take_along_axis(bottoms, lowest[..., None], axis=2)[:, :, 0]
+    if not slow.any():
+        return points.reshape(-1, 3)[points[..., 2].argmin()][None]
+    slow &= points[..., 2] < np.percentile(points[slow][:, 2], 10) + 0.12
+    stances = []
+    for foot in range(2):
+        on = slow[:, foot]
+        labels = np.cumsum(np.diff(on, prepend=False) & on)
+        for label in np.unique(labels[on]):
+            stances.append(np.median(points[on & (labels == label), foot], axis=0))
+    return np.array(stances)
+
+
+def _slope(stances: np.ndarray) -> tuple[float, np.ndarray]:
+    """Slope of the ground along the way the feet go, and that way [2].
+
+    The median of the slopes between all stances far apart, so that single high steps
+    do not count. Zero where there are not enough: it takes four places in a row, or a
+    jump would be taken for a slope.
+    """
+    centred = stances[:, :2] - stances[:, :2].mean(axis=0)
+    direction = np.linalg.svd(centred, full_matrices=False)[2][0]
+    along = np.sort(centred @ direction)
+    height = stances[np.argsort(centred @ direction), 2]
+    places = 1 + np.count_nonzero(np.diff(along) > NEXT_PLACE)
+    if np.ptp(along) < MIN_TRAVEL or places < 4:
+        return 0.0, direction
+    first, second = np.triu_indices(len(along), 1)
+    run = along[second] - along[first]
+    far = run > 0.5 * MIN_TRAVEL
+    slope = float(np.median(((height[second] - height[first]) / run)[far]))
+    return (slope if MIN_SLOPE < abs(slope) < MAX_SLOPE else 0.0), direction
+
+
+def contacts(clip: Clip) -> np.ndarray:
+    """Which parts of the feet stand on the ground z = 0, [T, 2, 2] boolean."""
+    centres = soles_of(clip.qpos)
+    parts = centres.reshape(len(centres), 2, 2, 2, 3).mean(axis=3)
+    height = parts[..., 2] - figure().radius
+    velocity = np.gradient(parts, 1.0 / clip.fps, axis=0)
+    speed = np.linalg.norm(velocity, axis=-1)
+    touch = (height < HEIGHTS[0]) & (speed < SPEEDS[0])
+    stay = (height < HEIGHTS[1]) & (speed < SPEEDS[1])
+    shortest = max(1, round(SHORTEST * clip.fps))
+    out = np.zeros_like(touch)
+    for foot in range(2):
+        for part in range(2):
+            held = _held(touch[:, foot, part], stay[:, foot, part])
+            out[:, foot, part] = _without_short_runs(held, shortest)
+    return out
+
+
+def _held(touch: np.ndarray, stay: np.ndarray) -> np.ndarray:
+    """Stretches of `stay` that hold some `touch`, [T]."""
+    labels = np.cumsum(np.diff(stay, prepend=False) & stay) * stay
+    return stay & np.isin(labels, np.unique(labels[touch & stay]))
+
+
+def _without_short_runs(on: np.ndarray, shortest: int) -> np.ndarray:
+    """The signal [T] with gaps, then stretches, shorter than `shortest` removed."""
+    window = 2 * (shortest // 2) + 1
+    return median_filter(on.astype(np.uint8), size=window, mode="nearest").astype(bool)

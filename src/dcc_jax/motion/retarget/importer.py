@@ -1,0 +1,166 @@
+"""Any motion file into a clip of the character."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from dcc_jax.motion.formats.asf import is_asf
+from dcc_jax.motion.formats.asf_amc import (
+    DEFAULT_FPS,
+    choose_skeleton,
+    is_amc,
+    read_amc,
+    skeletons_beside,
+)
+from dcc_jax.motion.formats.bvh import is_bvh, read_bvh
+from dcc_jax.motion.formats.deepmimic import is_deepmimic, read_deepmimic
+from dcc_jax.motion.formats.npz import MotionError
+from dcc_jax.motion.formats.poselib import is_poselib, read_poselib
+from dcc_jax.motion.formats.skeleton import (
+    Motion,
+    in_metres,
+    in_our_axes,
+    rest_on_frame,
+)
+from dcc_jax.motion.retarget.loops import as_loop
+from dcc_jax.motion.retarget.names import describe, is_plain, match
+from dcc_jax.motion.retarget.quality import measure
+from dcc_jax.motion.retarget.retarget import LOW_PASS, Retargeted, placed, retarget
+
+FORMATS = ("amc", "bvh", "deepmimic", "poselib")
+_HEAD = 4096  # bytes that tell the format
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the caller knows better than the file."""
+
+    format: str = "auto"
+    fps: float = 30.0  # of the clip
+    source_fps: float | None = None  # of the file
+    unit: str | None = None
+    up: str | None = None
+    names: Mapping[str, str] | None = None  # node by body
+    rest_frame: int | None = None  # a frame that stands upright, arms out or down
+    trim: tuple[float, float] | None = None  # s
+    loop: bool = False
+    low_pass: float = LOW_PASS  # Hz; 0 keeps everything
+    clean: bool = True
+
+
+def detect_format(path: Path) -> str:
+    """`asf` or one of `FORMATS`, from the content.
+
+    Raises:
+        MotionError: the file cannot be read, or is nothing known.
+    """
+    try:
+        with open(path, "rb") as stream:
+            data = stream.read(_HEAD)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise MotionError(path, f"cannot be read: {reason}") from None
+    if not data.strip():
+        raise MotionError(path, "the file is empty")
+    head = data.removeprefix(b"\xef\xbb\xbf").decode("latin-1")
+    tests = {
+        "poselib": is_poselib(data),
+        "bvh": is_bvh(head),
+        "deepmimic": is_deepmimic(head),
+        "amc": is_amc(head),
+        "asf": is_asf(head),
+    }
+    found = next((name for name, fits in tests.items() if fits), None)
+    if found is None:
+        raise MotionError(path, f"the format is none of asf, {', '.join(FORMATS)}")
+    return found
+
+
+def read_motion(path: Path, options: Options, skeletons: Sequence[Path]) -> Motion:
+    """Reads a file of any format, as it is.
+
+    Args:
+        path: the motion.
+        options: the format and the frame rate, where they are given.
+        skeletons: `.asf` files for motions that need one; by default what lies beside.
+
+    Raises:
+        MotionError: anything wrong with the file.
+    """
+    kind = detect_format(path) if options.format == "auto" else options.format
+    if kind == "asf":
+        raise MotionError(path, "a skeleton alone holds no motion")
+    if kind == "amc":
+        given = bool(skeletons)
+        skeleton = choose_skeleton(path, skeletons or skeletons_beside(path))
+        motion = read_amc(path, skeleton, options.source_fps or DEFAULT_FPS)
+        notes = [] if given else [f"skeleton {skeleton.name}, found beside it"]
+        if options.source_fps is None:
+            notes.append(f"the file states no frame rate, taken as {DEFAULT_FPS:g} fps")
+        return replace(motion, notes=(*notes, *motion.notes))
+    readers = {"bvh": read_bvh, "deepmimic": read_deepmimic, "poselib": read_poselib}
+    motion = readers[kind](path)
+    return replace(motion, fps=options.source_fps or motion.fps)
+
+
+def import_motion(
+    path: Path, options: Options, skeletons: Sequence[Path] = ()
+) -> Retargeted:
+    """A clip of the character from a file.
+
+    Raises:
+        MotionError: whatever is wrong, in one line.
+    """
+    try:
+        motion = read_motion(path, options, skeletons)
+        # Damaged numbers may be large enough to overflow; what comes out is checked.
+        with np.errstate(all="ignore"):
+            return _imported(motion, options)
+    except MotionError:
+        raise
+    except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
+        raise MotionError(path, str(error)) from None
+    except MemoryError:
+        raise MotionError(path, "too long to hold in memory") from None
+
+
+def _imported(motion: Motion, options: Options) -> Retargeted:
+    if options.rest_frame is not None:
+        motion = rest_on_frame(motion, options.rest_frame)
+    if options.trim is not None:
+        motion = _trimmed(motion, *options.trim)
+    bodies = match(motion, options.names)
+    if not is_plain(motion, bodies):
+        matched = f"please check the joints: {describe(motion, bodies)}"
+        motion = replace(motion, notes=(*motion.notes, matched))
+    motion = in_our_axes(in_metres(motion, bodies, options.unit), bodies, options.up)
+    if options.loop:
+        motion = replace(motion, loop=False)
+    result = retarget(motion, bodies, options.fps, options.low_pass, options.clean)
+    if not options.loop:
+        return result
+    clip = placed(as_loop(result.clip))
+    return replace(result, clip=clip, after=measure(clip))
+
+
+def _trimmed(motion: Motion, start: float, stop: float) -> Motion:
+    """The motion between two times, s.
+
+    Raises:
+        MotionError: less than 2 frames lie between them.
+    """
+    last = (len(motion.root) - 1) / motion.fps
+    stop = min(stop, last)
+    if not (0.0 <= start < stop and math.isfinite(start)):
+        raise MotionError(
+            motion.path, f"nothing between {start:g} and {stop:g} s of {last:.2f} s"
+        )
+    part = slice(round(start * motion.fps), round(stop * motion.fps) + 1)
+    if part == slice(0, len(motion.root)):
+        return motion
+    return replace(motion.part(part), loop=False)

@@ -1,0 +1,36 @@
+"""The physics of one scene: the only package that calls MJX.
+
+`scene` compiles a model, `step` moves it; both are used as `physics.make_scene(...)`,
+`physics.solve(...)`. The contact solver and its sparsity are this package's own.
+"""
+
+from dcc_jax.physics.scene import Scene, make_scene
+from dcc_jax.physics.step import (
+    Kinematics,
+    Solution,
+    State,
+    World,
+    default_world,
+    initial_state,
+    integrate,
+    kinematics,
+    mass_solve,
+    point_jacobian,
+    solve,
+)
+
+__all__ = [
+    "Kinematics",
+    "Scene",
+    "Solution",
+    "State",
+    "World",
+    "default_world",
+    "initial_state",
+    "integrate",
+    "kinematics",
+    "make_scene",
+    "mass_solve",
+    "point_jacobian",
+    "solve",
+]

@@ -1,0 +1,161 @@
+"""A compiled scene: its models, where the character lies in it, its contact slots.
+
+Letters: C contacts, R constraint rows, nv degrees of freedom, all of one scene.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import io
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from dcc_jax.character import Character
+from dcc_jax.physics.sparsity import Arrow, arrow
+from dcc_jax.quat import Coordinates
+
+with contextlib.redirect_stdout(io.StringIO()):
+    # It prints that Warp is missing, which only CUDA could use.
+    from mujoco import mjx
+
+Array = jax.Array
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A compiled scene and where the character lies in it. Hashable by identity."""
+
+    model: mujoco.MjModel  # C model, with h*kv in dof_armature and eulerdamp off
+    character: Character
+    coords: Coordinates
+    qpos_adr: int  # of the character's free joint; it takes 55 entries from there
+    dof_adr: int  # likewise in qvel, 42 entries
+    newton_iterations: int
+    spd_diagonal: np.ndarray  # [nv] h*kv, what `dof_armature` holds beyond the model's
+    mjx_model: mjx.Model  # on the device; constants of the compiled program
+    template: mjx.Data  # constant: every step starts from it, only `State` is carried
+    contact_bodies: np.ndarray  # [C, 2] body ids; the force acts on the second
+    arrow: Arrow  # where the matrices of the contact solver can be non-zero
+    mass_arrow: Arrow  # where the mass matrix alone can
+
+    @property
+    def timestep(self) -> float:
+        """Physics step in s."""
+        return float(self.model.opt.timestep)
+
+    def body(self, name: str) -> int:
+        """Id of a body by name.
+
+        Raises:
+            ValueError: no such body in the scene.
+        """
+        names = [self.model.body(i).name for i in range(self.model.nbody)]
+        if name not in names:
+            raise ValueError(f"unknown body {name!r}; the scene has {names}")
+        return names.index(name)
+
+    def character_qpos(self, qpos: Array) -> Array:
+        """The character's slice [..., 55] of qpos [..., nq]."""
+        return qpos[..., self.qpos_adr : self.qpos_adr + self.character.nq]
+
+    def character_qvel(self, qvel: Array) -> Array:
+        """The character's slice [..., 42] of qvel, or of any [..., nv]."""
+        return qvel[..., self.dof_adr : self.dof_adr + self.character.nv]
+
+    def scatter_character(self, values: Array) -> Array:
+        """[nv] with the character's [42] values in place and zeros elsewhere."""
+        after = self.model.nv - self.dof_adr - self.character.nv
+        return jnp.pad(values, (self.dof_adr, after))
+
+
+def make_scene(
+    model: mujoco.MjModel,
+    character: Character,
+    *,
+    root: str = "root",
+    newton_iterations: int = 8,
+) -> Scene:
+    """A scene ready to step, its stable PD built in.
+
+    Args:
+        model: from `character.compose_scene`; it is copied, not changed.
+        character: whose gains the implicit part of the PD uses.
+        root: name of the character's free joint in the model.
+        newton_iterations: of the contact solver, at most (docs/performance.md).
+
+    Raises:
+        ValueError: no joint `root`, or `newton_iterations` < 1.
+    """
+    names = [model.joint(i).name for i in range(model.njnt)]
+    if root not in names:
+        raise ValueError(f"unknown root joint {root!r}; the scene has {names}")
+    if newton_iterations < 1:
+        raise ValueError(f"newton_iterations must be >= 1, got {newton_iterations}")
+    model = copy.copy(model)
+    dof_adr = int(model.joint(root).dofadr[0])
+    spd = np.zeros(model.nv)
+    spd[dof_adr : dof_adr + character.nv] = model.opt.timestep * character.kv
+    model.dof_armature += spd
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    mjx_model = mjx.put_model(model)
+    template = mjx.make_data(mjx_model)
+    contact_bodies = _contact_bodies(model, mjx_model, template)
+    return Scene(
+        model=model,
+        character=character,
+        coords=Coordinates.of(model),
+        qpos_adr=int(model.joint(root).qposadr[0]),
+        dof_adr=dof_adr,
+        newton_iterations=newton_iterations,
+        spd_diagonal=spd,
+        mjx_model=mjx_model,
+        template=template,
+        contact_bodies=contact_bodies,
+        arrow=arrow(model, _row_pattern(model, contact_bodies)),
+        mass_arrow=arrow(model, np.zeros((0, model.nv), bool)),
+    )
+
+
+def _contact_bodies(
+    model: mujoco.MjModel, mjx_model: mjx.Model, template: mjx.Data
+) -> np.ndarray:
+    """[C, 2] bodies of MJX's contact slots.
+
+    Their geoms are constants of the traced program; the rest of it is never computed.
+    """
+    geoms = jax.jit(lambda: mjx.collision(mjx_model, template)._impl.contact.geom)()
+    return model.geom_bodyid[np.asarray(geoms)]
+
+
+def _row_pattern(model: mujoco.MjModel, contact_bodies: np.ndarray) -> np.ndarray:
+    """[R, nv] where MJX's constraint rows can be non-zero, in its order of rows."""
+    rows = []
+    order = (mujoco.mjtEq.mjEQ_CONNECT, 3), (mujoco.mjtEq.mjEQ_WELD, 6)
+    for kind, count in order:
+        for i in np.flatnonzero(model.eq_type == kind):
+            one, other = model.eq_obj1id[i], model.eq_obj2id[i]
+            if model.eq_objtype[i] == mujoco.mjtObj.mjOBJ_SITE:
+                one, other = model.site_bodyid[[one, other]]
+            rows += [_chain(model, one) | _chain(model, other)] * count
+    for i in np.flatnonzero(model.jnt_limited):
+        row = np.zeros(model.nv, bool)
+        row[model.dof_jntid == i] = True
+        rows.append(row)
+    for one, other in contact_bodies:
+        rows += [_chain(model, one) | _chain(model, other)] * 4
+    return np.array(rows, bool).reshape(-1, model.nv)
+
+
+def _chain(model: mujoco.MjModel, body: int) -> np.ndarray:
+    """[nv] the degrees of freedom that move a body."""
+    moves = np.zeros(model.nv, bool)
+    while body:
+        start = model.body_dofadr[body]
+        moves[start : start + model.body_dofnum[body]] = True
+        body = model.body_parentid[body]
+    return moves

@@ -1,0 +1,181 @@
+"""The physics of one scene: one step and what a step needs.
+
+One step is read as it runs:
+
+    kin = kinematics(scene, state)                     # where everything is
+    solution = solve(scene, kin, state, qfrc)          # accelerations and forces
+    state = integrate(scene, state, solution)          # semi-implicit Euler
+
+`qfrc` are the generalized forces of the controller and of pushes. The stable PD of
+Sec. 5.1 costs nothing: `make_scene` adds h*kv to the diagonal of the mass matrix, so
+the one factorization of a step is that of M + h Kv (`control.pd` has the other half).
+`mass_solve` uses the true mass matrix, without it.
+
+Letters: C contacts, E equality constraints, nv degrees of freedom, all of one scene.
+Every function is for ONE environment; callers vmap.
+"""
+
+from __future__ import annotations
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dcc_jax import quat
+from dcc_jax.physics.contact_solver import Rows, newton, solve_mass
+from dcc_jax.physics.scene import Scene, mjx
+
+Array = jax.Array
+
+
+@flax.struct.dataclass
+class State:
+    """What the physics carries from step to step, and nothing else."""
+
+    qpos: Array  # [nq]
+    qvel: Array  # [nv]
+    qacc: Array  # [nv] of the last step, where the contact solver starts
+
+
+@flax.struct.dataclass
+class World:
+    """What the scene's surroundings do in a step: kinematic bodies and switches."""
+
+    mocap_pos: Array  # [nmocap, 3] m, world
+    mocap_quat: Array  # [nmocap, 4]
+    equality_active: Array  # [E] bool
+
+
+@flax.struct.dataclass
+class Kinematics:
+    """Everything that depends on positions alone."""
+
+    data: mjx.Data
+
+    @property
+    def body_pos(self) -> Array:
+        """[nbody, 3] m, world; entry 0 is the world body."""
+        return self.data.xpos
+
+    @property
+    def body_quat(self) -> Array:
+        """[nbody, 4]."""
+        return self.data.xquat
+
+    @property
+    def body_center(self) -> Array:
+        """Centres of mass [nbody, 3] m, world."""
+        return self.data.xipos
+
+
+@flax.struct.dataclass
+class Solution:
+    """Accelerations of a step and the constraint forces that go with them."""
+
+    qacc: Array  # [nv]
+    contact_force_w: Array  # [C, 3] N on the second body of `Scene.contact_bodies`
+    contact_point_w: Array  # [C, 3] m
+    equality_force: Array  # [rows of equalities] N or N m, MuJoCo's row order
+
+
+def initial_state(scene: Scene, qpos: Array, qvel: Array) -> State:
+    """A state from coordinates [nq] and velocities [nv]; needs no physics."""
+    return State(qpos=qpos, qvel=qvel, qacc=jnp.zeros(scene.model.nv, qvel.dtype))
+
+
+def default_world(scene: Scene) -> World:
+    """The surroundings as the model declares them."""
+    data = scene.template
+    return World(data.mocap_pos, data.mocap_quat, data.eq_active.astype(bool))
+
+
+def kinematics(scene: Scene, state: State, world: World | None = None) -> Kinematics:
+    """Poses, motion axes, mass matrix, contacts and constraint rows of a state."""
+    model = scene.mjx_model
+    data = scene.template.replace(qpos=state.qpos, qvel=state.qvel)
+    if world is not None:
+        data = data.replace(
+            mocap_pos=world.mocap_pos,
+            mocap_quat=world.mocap_quat,
+            eq_active=world.equality_active,
+        )
+    data = mjx.kinematics(model, data)
+    data = mjx.com_pos(model, data)
+    data = mjx.crb(model, data)
+    data = mjx.collision(model, data)
+    data = mjx.make_constraint(model, data)
+    return Kinematics(data=data)
+
+
+def solve(scene: Scene, kin: Kinematics, state: State, qfrc: Array) -> Solution:
+    """Accelerations under applied generalized forces, contacts and equalities.
+
+    Args:
+        scene: the scene.
+        kin: of the same state.
+        state: positions, velocities and the last accelerations.
+        qfrc: applied generalized forces [nv], N and N m.
+    """
+    model, data = scene.mjx_model, kin.data
+    data = mjx.com_vel(model, data)
+    data = mjx.passive(model, data)
+    data = mjx.rne(model, data)
+    smooth = qfrc + data.qfrc_passive - data.qfrc_bias
+    rows = Rows(
+        J=data._impl.efc_J,
+        D=data._impl.efc_D,
+        aref=data._impl.efc_aref,
+        num_equality=data._impl.ne,
+    )
+    mass = mjx.full_m(model, data)
+    qacc, force = newton(
+        scene.arrow, mass, smooth, rows, state.qacc, scene.newton_iterations
+    )
+    contact_force_w, contact_point_w = _contact_forces(data, force)
+    return Solution(
+        qacc=qacc,
+        contact_force_w=contact_force_w,
+        contact_point_w=contact_point_w,
+        equality_force=force[: data._impl.ne],
+    )
+
+
+def _contact_forces(data: mjx.Data, force: Array) -> tuple[Array, Array]:
+    """World forces [C, 3] and points [C, 3] from pyramid edge forces.
+
+    The pyramid of a condim-3 contact has four edges: normal +- mu tangent.
+    """
+    contact = data._impl.contact
+    edges = force[contact.efc_address[:, None] + np.arange(4)]
+    friction = contact.friction[:, :2]
+    tangents = friction * (edges[:, 0::2] - edges[:, 1::2])
+    local = jnp.concatenate([edges.sum(-1, keepdims=True), tangents], axis=-1)
+    return jnp.sum(local[:, :, None] * contact.frame, axis=1), contact.pos
+
+
+def integrate(scene: Scene, state: State, solution: Solution) -> State:
+    """Semi-implicit Euler (Sec. 3.1): first the velocities, then the positions."""
+    h = scene.timestep
+    qvel = state.qvel + h * solution.qacc
+    qpos = quat.integrate(scene.coords, state.qpos, qvel, h)
+    return State(qpos=qpos, qvel=qvel, qacc=solution.qacc)
+
+
+def point_jacobian(scene: Scene, kin: Kinematics, point_w: Array, body: Array) -> Array:
+    """J [3, nv] of a point [3] (m, world) fixed to a body (id): v_w = J qvel."""
+    jac, _ = mjx.jac(scene.mjx_model, kin.data, point_w, body)
+    return jac.T
+
+
+def mass_solve(scene: Scene, kin: Kinematics, qfrc: Array) -> Array:
+    """M^-1 qfrc with the true mass matrix (no h*kv), for qfrc [nv] or [F, nv].
+
+    With qfrc = J^T f this is FD(q, qd, f) - FD(q, qd, 0) of Alg. 1, because forward
+    dynamics is linear in the external force.
+    """
+    mass = mjx.full_m(scene.mjx_model, kin.data)
+    solved = solve_mass(
+        scene.mass_arrow, mass, scene.spd_diagonal, jnp.atleast_2d(qfrc)
+    )
+    return solved.reshape(qfrc.shape)

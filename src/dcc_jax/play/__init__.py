@@ -1,0 +1,1 @@
+"""Trained policies in their environments: what evaluation and rendering share."""

@@ -1,0 +1,91 @@
+"""Trained policies: where they are found, and the environments they act in."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+from dcc_jax import config, tasks
+from dcc_jax.character import asset_path
+from dcc_jax.config import Config
+from dcc_jax.env.environment import Environment
+from dcc_jax.env.task import Task
+from dcc_jax.learn.rollout import Policy
+from dcc_jax.training import checkpoint
+
+_FOREVER = 1e6  # s
+
+
+@dataclass(frozen=True)
+class Run:
+    """A trained policy and the configuration that made it."""
+
+    name: str
+    config: Config
+    policy: Policy
+
+    @property
+    def alphas(self) -> tuple[float, float]:
+        """The least and the greatest level of compliance it was trained with."""
+        env = self.config.env
+        return env.alpha, env.alpha if env.alpha_max is None else env.alpha_max
+
+
+def find_run(name: str | Path) -> Run:
+    """The policy in a run directory, or one of those that ship, by path or name.
+
+    Raises:
+        ValueError: there is none, or it is damaged.
+    """
+    path = Path(name)
+    if not path.exists():
+        path = _shipped(str(name))
+    return Run(str(name), config.load(path), checkpoint.load_policy(path))
+
+
+def _shipped(name: str) -> Path:
+    """The directory of a policy that ships: `push` and `assets/policies/push` alike."""
+    try:
+        folder = asset_path("policies")
+        known = sorted(entry.name for entry in folder.iterdir())
+    except FileNotFoundError:
+        folder, known = Path(), []
+    if Path(name).name in known and Path(name).parts[:-1] in (
+        (),
+        ("assets", "policies"),
+    ):
+        return folder / Path(name).name
+    ships = f"; policies that ship: {', '.join(known)}" if known else ""
+    raise ValueError(f"{name} is not a run directory{ships}")
+
+
+def make_environment(run: Run, task: Task | None = None) -> Environment:
+    """The environment of a run, without an end: episodes are as long as one likes.
+
+    A clip that the task follows in time is played from its start, not from anywhere.
+
+    Args:
+        run: whose configuration counts.
+        task: in place of the configured one, e.g. a door of another width.
+
+    Raises:
+        ValueError: an unknown task, clips that are missing or damaged, or another
+            observation or action than the policy's.
+    """
+    task = tasks.make_task(run.config.task) if task is None else task
+    env = dataclasses.replace(
+        run.config.env,
+        episode_seconds=_FOREVER,
+        random_start=run.config.env.random_start and not task.tracks_reference,
+    )
+    environment = tasks.make_environment(task, env)
+    sizes = environment.observation_size, environment.action_size
+    layers = run.policy.params.layers
+    has = layers[0].kernel.shape[0], layers[-1].kernel.shape[1]
+    if has != sizes:
+        raise ValueError(
+            f"the policy of {run.name} has {has[0]} observations and {has[1]} actions, "
+            f"task {environment.task.name} has {sizes[0]} and {sizes[1]}"
+        )
+    return environment

@@ -1,0 +1,312 @@
+"""The training loop: compile, update, log, save, stop."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any
+
+import jax
+import numpy as np
+
+from dcc_jax import config, tasks
+from dcc_jax.config import Config
+from dcc_jax.learn import learner, style
+from dcc_jax.learn.rollout import Environment, Policy
+from dcc_jax.learn.state import TrainState, UpdateReport
+from dcc_jax.training import checkpoint, logs
+
+_MAY_CHANGE = ("train.total_tuples", "train.checkpoint_interval")
+_MAX_DUMPS = 20
+
+
+class RunError(RuntimeError):
+    """A run that began and could not go on."""
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """What a run leaves."""
+
+    params: Policy  # the policy with its normaliser, host arrays
+    metrics: list[dict[str, float]]  # one entry an update, as in metrics.jsonl
+    run_dir: Path
+    finished: bool  # False: a signal ended it before all tuples were collected
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run that is about to begin: all that can be wrong with its input is checked."""
+
+    config: Config
+    run_dir: Path
+    environment: Environment
+    mesh: jax.sharding.Mesh
+    resume: bool
+
+
+def train(
+    config: Config,
+    *,
+    run_dir: Path | str | None = None,
+    resume: bool = False,
+    environment: Environment | None = None,
+    quiet: bool = False,
+) -> TrainResult:
+    """Trains a policy, from nothing or from the last checkpoint.
+
+    Args:
+        config: of `make_config`.
+        run_dir: where everything goes; default `runs/<task>-<time>`.
+        resume: continue the run in `run_dir`, bit for bit.
+        environment: in place of the task's own.
+        quiet: no progress.
+
+    Raises:
+        ValueError: something about the arguments is wrong; nothing was written.
+        RunError: the run failed; its checkpoints are intact.
+    """
+    prepared = prepare(config, run_dir, resume, environment)
+    return execute(prepared, quiet=quiet)
+
+
+def prepare(
+    wanted: Config,
+    run_dir: Path | str | None = None,
+    resume: bool = False,
+    environment: Environment | None = None,
+) -> Run:
+    """Checks everything a user can get wrong, and begins the run directory.
+
+    Raises:
+        ValueError: naming the argument, its value and what is allowed.
+    """
+    if run_dir is None:
+        if resume:
+            raise ValueError("resume needs run_dir: the run to continue")
+        run_dir = default_run_dir(wanted.task)
+    run_dir = Path(run_dir)
+    if resume:
+        _check_resumable(config.load(run_dir), wanted, run_dir)
+    elif run_dir.exists() and (not run_dir.is_dir() or any(run_dir.iterdir())):
+        raise ValueError(
+            f"run_dir {run_dir} exists and is not empty; resume continues a run"
+        )
+    if environment is None:
+        environment = make_environment(wanted)
+    mesh = learner.make_mesh(wanted.train)
+    learner.check_sizes(wanted, mesh.size)
+    run_dir.mkdir(parents=True, exist_ok=True)
+    checkpoint.write_atomically(
+        run_dir / "config.json", config.to_json(wanted).encode()
+    )
+    return Run(wanted, run_dir, environment, mesh, resume)
+
+
+def default_run_dir(task: str) -> Path:
+    """`runs/<task>-<date>-<time>` in the working directory."""
+    return Path("runs") / f"{task}-{time.strftime('%Y%m%d-%H%M%S')}"
+
+
+def execute(run: Run, *, quiet: bool = False) -> TrainResult:
+    """Trains until all tuples are collected or a signal comes.
+
+    Raises:
+        RunError: the disk is full, every checkpoint is damaged, and the like.
+    """
+    with (
+        logs.Progress(run.config.train.total_tuples, quiet) as progress,
+        _StopSignal() as stop,
+    ):
+        try:
+            return _loop(run, progress, stop)
+        except (OSError, checkpoint.CheckpointError) as error:
+            raise RunError(f"{error}") from error
+
+
+def _loop(run: Run, progress: logs.Progress, stop: _StopSignal) -> TrainResult:
+    train = run.config.train
+    state, update = _prepared(run, progress.say)
+    measure_style = jax.jit(partial(style.of_running, run.environment))
+    done, nan_count = int(state.update), int(state.nan_count)
+    log = logs.RunLog(run.run_dir, done)
+    began, saved = time.perf_counter(), done
+    while done * train.tuples_per_update < train.total_tuples and not stop.name:
+        before = time.perf_counter()
+        state, report = update(state)
+        metrics = _floats(report.metrics)
+        done += 1
+        now = time.perf_counter()
+        metrics = {
+            "update": done,
+            "tuples": done * train.tuples_per_update,
+            "tuples_per_second": train.tuples_per_update / (now - before),
+            "seconds": now - began,
+        } | metrics
+        at_checkpoint = done % train.checkpoint_interval == 0
+        if at_checkpoint:
+            metrics |= _floats(measure_style(jax.device_get(state.running)))
+        log.write(metrics)
+        progress.show(metrics)
+        if metrics["nan_count"] > nan_count:
+            nan_count = int(metrics["nan_count"])
+            _dump(run.run_dir, done, report, progress.say)
+        if at_checkpoint:
+            _save(run, done, state)
+            saved = done
+    if saved != done:
+        _save(run, done, state)
+    log.close()
+    return _finish(run, done, state, stop, progress.say)
+
+
+def _prepared(
+    run: Run, say: Callable[[str], None]
+) -> tuple[TrainState, learner.Update]:
+    """The first state and the compiled update, which compile side by side."""
+    init = learner.make_init(run.environment, run.config, run.mesh)
+    template = jax.eval_shape(init, jax.random.key(run.config.seed), None)
+    with ThreadPoolExecutor(1) as beside:
+        update = beside.submit(_compiled, run, template, say)
+        state = _first_state(run, init, template, say)
+        return state, update.result()
+
+
+def _first_state(
+    run: Run,
+    init: learner.Init,
+    template: TrainState,
+    say: Callable[[str], None],
+) -> TrainState:
+    """From the last checkpoint, or drawn from the seed where there is none yet."""
+    key = jax.random.key(run.config.seed)
+    if run.resume:
+        found = checkpoint.restore_latest(run.run_dir, template, say)
+        if found is not None:
+            update, arrays = found
+            say(f"resuming {run.run_dir} after update {update}")
+            return jax.device_put(arrays, learner.state_shardings(run.mesh, arrays))
+    return init(key, None)
+
+
+def _compiled(
+    run: Run, template: TrainState, say: Callable[[str], None]
+) -> learner.Update:
+    say(f"compiling for {run.mesh.size} {jax.default_backend()} device(s) ...")
+    began = time.perf_counter()
+    update = learner.make_update(run.environment, run.config, run.mesh)
+    shardings = learner.state_shardings(run.mesh, template)
+    sharded = jax.tree.map(
+        lambda x, at: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=at),
+        template,
+        shardings,
+    )
+    compiled = update.lower(sharded).compile()
+    say(f"compiled in {time.perf_counter() - began:.1f} s")
+    return compiled
+
+
+def _save(run: Run, done: int, state: TrainState) -> None:
+    host = jax.device_get(state)
+    checkpoint.save(run.run_dir, done, host, run.config.train.keep_checkpoints)
+    checkpoint.save_policy(run.run_dir, _policy(host))
+
+
+def _floats(metrics: dict[str, jax.Array]) -> dict[str, float]:
+    return {name: float(value) for name, value in jax.device_get(metrics).items()}
+
+
+def _policy(state: TrainState) -> Policy:
+    return Policy(params=state.agent.policy.params, normalizer=state.obs_normalizer)
+
+
+def _finish(
+    run: Run,
+    done: int,
+    state: TrainState,
+    stop: _StopSignal,
+    say: Callable[[str], None],
+) -> TrainResult:
+    if stop.name:
+        say(
+            f"stopped by {stop.name} after update {done}; saved, "
+            f"continue with --resume --run-dir {run.run_dir}"
+        )
+    else:
+        say(f"finished after update {done}: {run.run_dir}")
+    return TrainResult(
+        params=_policy(jax.device_get(state)),
+        metrics=logs.read(run.run_dir),
+        run_dir=run.run_dir,
+        finished=not stop.name,
+    )
+
+
+def _dump(
+    run_dir: Path, done: int, report: UpdateReport, say: Callable[[str], None]
+) -> None:
+    """Keeps the state and action from which an environment broke."""
+    folder = run_dir / "nan"
+    folder.mkdir(exist_ok=True)
+    if len(list(folder.iterdir())) >= _MAX_DUMPS:
+        return
+    incident = jax.device_get(report.incident)
+    broken = int(np.argmax(incident.happened))
+    one = jax.tree.map(lambda x: x[broken], incident)
+    path = folder / f"update-{done:09d}.npz"
+    np.savez(path, **checkpoint.to_arrays(one))  # pyright: ignore[reportArgumentType]
+    say(f"an environment broke in update {done} and was reset; see {path}")
+
+
+def make_environment(wanted: Config) -> Environment:
+    """The environment of a configuration's task.
+
+    Raises:
+        ValueError: an unknown task, or clips that are missing or damaged.
+    """
+    return tasks.make_environment(tasks.make_task(wanted.task), wanted.env)
+
+
+def _check_resumable(old: Config, new: Config, run_dir: Path) -> None:
+    for name, before, after in config.differences(old, new):
+        if name not in _MAY_CHANGE:
+            raise ValueError(
+                f"{name} is {before} in {run_dir} and cannot become {after}; only "
+                f"{' and '.join(_MAY_CHANGE)} may change when a run is resumed"
+            )
+
+
+class _StopSignal:
+    """Notes SIGTERM and Ctrl-C; a second one interrupts at once."""
+
+    def __init__(self) -> None:
+        self.name = ""
+        self._previous: dict[int, Any] = {}
+
+    def __enter__(self) -> _StopSignal:
+        # Elsewhere than in the main thread Python gives no say over signals.
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGTERM, signal.SIGINT):
+                self._previous[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        if self.name:
+            raise KeyboardInterrupt
+        self.name = signal.Signals(number).name
