@@ -16,6 +16,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+CONTROL_RATE = 30  # Hz, Sec. 5.1
+CONTROL_DT = 1.0 / CONTROL_RATE  # s
+GRAVITY = 9.81  # m/s^2, MuJoCo's default
 STANDARD_MASS = 65.0  # kg, Sec. 5.1
 MASS_RANGE = (20.0, 150.0)  # kg; the paper uses 36, 65 and 85
 FEET = ("left_foot", "right_foot")

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from dcc_jax import physics
-from dcc_jax.character import asset_path, compose_scene, load_character
+from dcc_jax.character import CONTROL_DT, asset_path, compose_scene, load_character
 from dcc_jax.config import make_config
 from dcc_jax.motion.clip import load_clip
-from dcc_jax.motion.reference import CONTROL_DT, make_references
+from dcc_jax.motion.reference import make_references
 from dcc_jax.tasks.backflip import Backflip
 from dcc_jax.tasks.trampoline import Trampoline
 from dcc_jax.training import loop

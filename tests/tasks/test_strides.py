@@ -8,10 +8,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from dcc_jax.character import asset_path, compose_scene, load_character
+from dcc_jax.character import CONTROL_DT, asset_path, compose_scene, load_character
 from dcc_jax.motion import planner
 from dcc_jax.motion.clip import load_clip
-from dcc_jax.motion.reference import CONTROL_DT, References, make_references
+from dcc_jax.motion.reference import References, make_references
 from dcc_jax.tasks.hand_in_hand import HandInHand
 
 PHASES = np.arange(48) / 48

@@ -18,11 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from dcc_jax import physics, quat
-from dcc_jax.character import Character, compose_scene
+from dcc_jax.character import CONTROL_RATE, Character, compose_scene
 from dcc_jax.control import compliance, pd
 from dcc_jax.control.compliance import Displacement
 from dcc_jax.env import features, metrics, pairs, rewards
-from dcc_jax.env.config import CONTROL_RATE, EnvConfig
+from dcc_jax.env.config import EnvConfig
 from dcc_jax.env.state import ControlInputs, EnvState, Substep, terminate_on_nonfinite
 from dcc_jax.env.task import Forces, RootTarget, Task
 from dcc_jax.motion.reference import References, RefState

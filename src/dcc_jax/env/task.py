@@ -194,11 +194,16 @@ def place_character(scene: physics.Scene, reference: RefState) -> tuple[Array, A
     return qpos, scene.scatter_character(reference.qvel)
 
 
-def resultant(force_w: Array, point_w: Array) -> tuple[Array, Array]:
-    """One force [3] and its point [3] for contacts [C, 3] on one body.
+def resultant(
+    solution: physics.Solution, contacts: physics.Contacts
+) -> tuple[Array, Array]:
+    """The force [3] of contacts on one body, N, and its point [3], m, world.
 
     The point is the centre of pressure: the mean of the points, weighted by |f|.
     """
+    sign = jnp.asarray(contacts.sign)[:, None]
+    force_w = sign * solution.contact_force_w[contacts.slots]
+    point_w = solution.contact_point_w[contacts.slots]
     size = jnp.sqrt(jnp.sum(force_w * force_w, axis=-1) + 1e-12)
     weight = size / jnp.sum(size)
     return force_w.sum(axis=0), jnp.sum(weight[:, None] * point_w, axis=0)

@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from dcc_jax import quat
-from dcc_jax.character import load_character
+from dcc_jax.character import CONTROL_DT, load_character
 from dcc_jax.motion import paths
 from dcc_jax.motion.paths import Gaits, Motion, direction, path
-from dcc_jax.motion.reference import CONTROL_DT, References, RefState, planar_moved
+from dcc_jax.motion.reference import References, RefState, planar_moved
 
 Array = jax.Array
 

@@ -18,11 +18,17 @@ import jax.numpy as jnp
 import mujoco
 
 from dcc_jax import physics, quat
-from dcc_jax.character import Character, add_contact, compose_scene, sole_names
+from dcc_jax.character import (
+    CONTROL_DT,
+    Character,
+    add_contact,
+    compose_scene,
+    sole_names,
+)
 from dcc_jax.env.environment import Environment
 from dcc_jax.env.state import ControlInputs, EnvState, Substep
 from dcc_jax.motion import paths
-from dcc_jax.motion.reference import CONTROL_DT, References, RefState, planar_moved
+from dcc_jax.motion.reference import References, RefState, planar_moved
 from dcc_jax.tasks.chicken_fight import (
     FRICTION,
     TARGETS,
@@ -57,7 +63,7 @@ class Fighter(ChickenFight):
     ) -> ChickenFightState:
         """The reference ahead of the root, on its way to the opponent."""
         root = scene.character_qpos(body.qpos)[:2]
-        adr = int(scene.model.joint(self.opponent).qposadr[0])
+        adr, _ = scene.address(self.opponent)
         way = body.qpos[adr : adr + 2] - root
         heading = jnp.arctan2(way[1], way[0])
         motion = dataclasses.replace(
