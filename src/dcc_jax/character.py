@@ -134,6 +134,7 @@ class Character:
     nq = 55
     nv = 42
     num_joints = 12
+    num_joint_dofs = 36  # of qvel, after the 6 of the root
     joint_names = tuple(joint.name for joint in JOINTS)
     body_names = BODIES
     stand_height = 0.935  # m, of the pelvis when the soles of the zero pose touch z = 0

@@ -149,7 +149,7 @@ def test_clips_are_files_or_names_of_the_packages_own():
     np.testing.assert_array_equal(environment.references.frames, frames)
     # A crouch of the clips is no fall.
     lowest = environment.references.qpos[..., 2].min()
-    assert lowest < 0.55 and environment.fall_height == pytest.approx(lowest - 0.1)
+    assert lowest < 0.55 and environment.fallen.pelvis == pytest.approx(lowest - 0.1)
     env = dataclasses.replace(config.env, clips=("handstand",))
     with pytest.raises(FileNotFoundError, match="handstand"):
         loop.make_environment(dataclasses.replace(config, env=env))
