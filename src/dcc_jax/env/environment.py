@@ -20,7 +20,16 @@ from dcc_jax import physics, quat
 from dcc_jax.character import CONTROL_DT, Character, compose_scene
 from dcc_jax.control import compliance, pd
 from dcc_jax.control.compliance import Displacement
-from dcc_jax.env import expert, features, metrics, observation, outcome, pairs, rewards
+from dcc_jax.env import (
+    expert,
+    features,
+    metrics,
+    observation,
+    outcome,
+    pairs,
+    relative,
+    rewards,
+)
 from dcc_jax.env.config import EnvConfig
 from dcc_jax.env.state import ControlInputs, EnvState, Substep, terminate_on_nonfinite
 from dcc_jax.env.task import Forces, RootTarget, Task
@@ -30,7 +39,11 @@ Array = jax.Array
 
 
 class Environment:
-    """Static parts of one task's environment; its methods are pure."""
+    """Static parts of one task's environment; its methods are pure.
+
+    Raises:
+        ValueError: measured velocities where the reference is not followed in time.
+    """
 
     def __init__(
         self,
@@ -39,6 +52,7 @@ class Environment:
         references: References,
         config: EnvConfig,
     ) -> None:
+        _check_velocity(task, config)
         self.task = task
         self.config = config
         self.references = references
@@ -54,8 +68,11 @@ class Environment:
         alone = compose_scene(character, floor=False)
         self.kinematics = features.Kinematics.of(alone)
         self.nominal = jax.jit(expert.nominal_pose)(references)
-        self.return_stiffness = compliance.return_stiffness(
-            config.compliance, character.nv
+        self.controller = compliance.Controller(
+            config.compliance,
+            self.kinematics.coords,
+            character.column_weight,
+            self.scene.timestep,
         )
         self.fallen = outcome.FallTest.of(config, references)
         self.expert_lead = expert.lead(character, CONTROL_DT)
@@ -142,7 +159,9 @@ class Environment:
         pose = self._target_pose(reference, action)
         sums = metrics.no_sums(state.alpha)
         start = Substep(body, state.displacement, task, state.time, sums)
-        return start, ControlInputs(action, pose, state.alpha, reference)
+        return start, ControlInputs(
+            action, pose, state.alpha, state.reference, reference, state.time
+        )
 
     def end(self, state: EnvState, plan: ControlInputs, end: Substep) -> EnvState:
         """The state after a control step, by that before it and its last substep."""
@@ -237,11 +256,11 @@ class Environment:
         """
         scene, task = self.scene, self.task
         task_state, forces = task.forces(scene, carry.task, kin, solution, plan.action)
-        displacement = self._displaced(carry, kin, forces, plan.alpha)
+        displacement = self.displaced(carry, plan, kin, forces)
         sums = metrics.add(
             carry.sums,
             jnp.where(forces.gate, forces.force_w, 0.0),
-            self._felt(tau, solution.qacc),
+            self._joint_torque(tau, solution.qacc),
             scene.character_qvel(carry.body.qvel)[6:],
             scene.timestep,
         )
@@ -253,7 +272,7 @@ class Environment:
             sums=sums,
         ), forces
 
-    def _felt(self, tau: Array, qacc: Array) -> Array:
+    def _joint_torque(self, tau: Array, qacc: Array) -> Array:
         """Torques [36] of the joints: tau less the stable PD's implicit h kv qacc."""
         implicit = jnp.asarray(self.scene.spd_diagonal, qacc.dtype) * qacc
         return (tau - self.scene.character_qvel(implicit))[6:]
@@ -280,39 +299,28 @@ class Environment:
             scene.timestep,
         )
 
-    def _displaced(
-        self, carry: Substep, kin: physics.Kinematics, forces: Forces, alpha: Array
+    def displaced(
+        self,
+        carry: Substep,
+        plan: ControlInputs,
+        kin: physics.Kinematics,
+        forces: Forces,
     ) -> Displacement:
-        """Alg. 1 for one physics step."""
-        scene, config = self.scene, self.config.compliance
+        """u and its velocity a physics step later."""
+        scene = self.scene
         jacobian = jax.vmap(lambda p, b: physics.point_jacobian(scene, kin, p, b))
-        J = jacobian(forces.point_w, forces.body)
+        J = scene.character_qvel(jacobian(forces.point_w, forces.body))
         force = jnp.where(forces.gate, forces.force_w, 0.0)
-        if config.velocity == "forward_dynamics":
-            qfrc = jnp.sum(J * force[:, :, None], axis=1)
-            motion = scene.character_qvel(physics.mass_solve(scene, kin, qfrc))
-        else:
-            weights = jnp.asarray(scene.character.column_weight, J.dtype)
-            acts = jnp.any(force != 0.0, axis=-1, keepdims=True)
-            qvel = scene.character_qvel(carry.body.qvel)
-            motion = acts * compliance.point_velocity(
-                scene.character_qvel(J), qvel, weights
-            )
-        ud = compliance.displacement_velocity(
-            scene.character_qvel(J),
-            motion,
-            alpha,
-            jnp.asarray(scene.character.column_weight, J.dtype),
-            config,
-        )
-        return compliance.advance(
-            self.kinematics.coords,
-            carry.displacement,
-            ud,
-            compliance.acting(force),
-            scene.timestep,
-            self.return_stiffness,
-        )
+        given = self.controller, carry.displacement, J, force, plan.alpha
+        if self.config.compliance.velocity == "measured":
+            xd = relative.velocity(scene, self.kinematics, carry, plan, J, forces)
+            return compliance.measured(*given, xd)
+
+        def mass_solve(qfrc: Array) -> Array:
+            qfrc = jax.vmap(scene.scatter_character)(qfrc)
+            return scene.character_qvel(physics.mass_solve(scene, kin, qfrc))
+
+        return compliance.algorithm_1(*given, mass_solve)
 
     def observed(self, state: EnvState) -> EnvState:
         """Fills in the features and the observation."""
@@ -364,6 +372,14 @@ class Environment:
         if self.task.tracks_reference:
             return RootTarget(state.reference.qpos[:2], state.reference.qvel[:2])
         return self.task.root_target(self.scene, state.task, state.start, state.time)
+
+
+def _check_velocity(task: Task, config: EnvConfig) -> None:
+    if config.compliance.velocity == "measured" and not task.tracks_reference:
+        raise ValueError(
+            "env.compliance.velocity must be 'forward_dynamics' for task "
+            f"{task.name!r}, which follows no reference in time, got 'measured'"
+        )
 
 
 def _at_origin(reference: RefState) -> RefState:
