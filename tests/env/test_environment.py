@@ -139,7 +139,7 @@ def test_the_pd_target_is_displaced_unless_it_is_switched_off(
     if displaced:
         wanted = quat.oplus(coords, wanted, state.displacement.u)
     expected = pd.torque(scene.character, q, qd, wanted, scene.timestep)
-    tau = environment.torque(carry, inputs)
+    tau = environment.side.torque(carry, inputs)
     np.testing.assert_allclose(tau, expected, rtol=1e-5)
     other = pd.torque(scene.character, q, qd, inputs.pose, scene.timestep)
     assert np.allclose(tau, other) != displaced, "u must be large enough to be seen"

@@ -104,7 +104,7 @@ def test_a_runner_on_its_reference_is_not_displaced_by_any_force(character):
         def displaced(body):
             force, point = jnp.array([[0.0, 80.0, 0.0]]), kin.body_center[body]
             forces = Forces(force, point[None], body[None], jnp.ones((), bool))
-            return environment.displaced(carry, plan, kin, forces).ud
+            return environment.side.displaced(carry, plan, kin, forces).ud
 
         return jax.vmap(displaced)(ids), jnp.linalg.norm(qd_m[:2])
 

@@ -1,11 +1,8 @@
-"""One environment: forces, compliance, PD, physics, features, rewards.
+"""One environment: a task, a character and its reference, step by step.
 
-A control step is `control_steps` physics steps of
-
-    kinematics -> PD torques (Eq. 2) -> MJX -> external forces -> u (Alg. 1) -> advance,
-
-then the state (Sec. 4.2), the positional and the task reward (Eq. 14), and whether the
-episode ends. It knows no task and no discriminator; both come from outside.
+A control step is `control_steps` physics steps (`env.substep`), then the state (Sec.
+4.2), the positional and the task reward (Eq. 14), and whether the episode ends. It
+knows no task and no discriminator; both come from outside.
 """
 
 from __future__ import annotations
@@ -18,8 +15,7 @@ import jax.numpy as jnp
 
 from dcc_jax import physics, quat
 from dcc_jax.character import CONTROL_DT, Character, compose_scene
-from dcc_jax.control import compliance, pd
-from dcc_jax.control.compliance import Displacement
+from dcc_jax.control import compliance
 from dcc_jax.env import (
     expert,
     features,
@@ -27,11 +23,11 @@ from dcc_jax.env import (
     observation,
     outcome,
     pairs,
-    relative,
     rewards,
 )
 from dcc_jax.env.config import EnvConfig
 from dcc_jax.env.state import ControlInputs, EnvState, Substep, terminate_on_nonfinite
+from dcc_jax.env.substep import physics_step
 from dcc_jax.env.task import Forces, RootTarget, Task
 from dcc_jax.motion.reference import References, RefState
 
@@ -141,14 +137,25 @@ class Environment:
     def _step(
         self, key: Array, state: EnvState, action: Array, record: bool
     ) -> tuple[EnvState, Any]:
-        def substep(carry: Substep, _: None) -> tuple[Substep, Forces | None]:
-            carry, forces = self._substep(carry, plan)
+        def one(carry: Substep, _: None) -> tuple[Substep, Forces | None]:
+            ((carry, forces),) = physics_step([self.side], [carry], [inputs])
             return carry, forces if record else None
 
-        start, plan = self.begin(key, state, action)
+        start, inputs = self.begin(key, state, action)
         steps = self.config.control_steps
-        end, forces = jax.lax.scan(substep, start, None, length=steps)
-        return self.end(state, plan, end), forces
+        end, forces = jax.lax.scan(one, start, None, length=steps)
+        return self.end(state, inputs, end), forces
+
+    @property
+    def side(self) -> Side:
+        """What a physics step needs of this environment."""
+        return Side(
+            self.scene,
+            self.task,
+            self.kinematics,
+            self.controller,
+            self.config.displace_target,
+        )
 
     def begin(
         self, key: Array, state: EnvState, action: Array
@@ -163,7 +170,7 @@ class Environment:
             action, pose, state.alpha, state.reference, reference, state.time
         )
 
-    def end(self, state: EnvState, plan: ControlInputs, end: Substep) -> EnvState:
+    def end(self, state: EnvState, inputs: ControlInputs, end: Substep) -> EnvState:
         """The state after a control step, by that before it and its last substep."""
         new = dataclasses.replace(
             state,
@@ -171,7 +178,7 @@ class Environment:
             displacement=end.displacement,
             task=end.task,
             time=end.time,
-            reference=plan.reference,
+            reference=inputs.reference,
             q_previous=self.scene.character_qpos(state.body.qpos),
             u_previous=state.displacement.u,
             previous_features=state.features,
@@ -227,56 +234,6 @@ class Environment:
             return jnp.asarray(low)
         return jax.random.uniform(key, minval=low, maxval=high)
 
-    def _substep(self, carry: Substep, plan: ControlInputs) -> tuple[Substep, Forces]:
-        scene, task = self.scene, self.task
-        world = task.world(scene, carry.task, carry.time)
-        kin = physics.kinematics(scene, carry.body, world)
-        tau = self.torque(carry, plan)
-        qfrc = scene.scatter_character(tau)
-        qfrc = qfrc + task.applied(scene, carry.task, kin, carry.time)
-        solution = physics.solve(scene, kin, carry.body, qfrc)
-        return self.react(carry, plan, kin, tau, solution)
-
-    def react(
-        self,
-        carry: Substep,
-        plan: ControlInputs,
-        kin: physics.Kinematics,
-        tau: Array,
-        solution: physics.Solution,
-    ) -> tuple[Substep, Forces]:
-        """A physics step later: what the solution does to body and displacement.
-
-        Args:
-            carry: at the beginning of the physics step.
-            plan: of the control step.
-            kin: at the beginning of the physics step.
-            tau: torques applied to the character [42], from `torque`.
-            solution: accelerations and forces under them.
-        """
-        scene, task = self.scene, self.task
-        task_state, forces = task.forces(scene, carry.task, kin, solution, plan.action)
-        displacement = self.displaced(carry, plan, kin, forces)
-        sums = metrics.add(
-            carry.sums,
-            jnp.where(forces.gate, forces.force_w, 0.0),
-            self._joint_torque(tau, solution.qacc),
-            scene.character_qvel(carry.body.qvel)[6:],
-            scene.timestep,
-        )
-        return Substep(
-            body=physics.integrate(scene, carry.body, solution),
-            displacement=displacement,
-            task=task_state,
-            time=carry.time + scene.timestep,
-            sums=sums,
-        ), forces
-
-    def _joint_torque(self, tau: Array, qacc: Array) -> Array:
-        """Torques [36] of the joints: tau less the stable PD's implicit h kv qacc."""
-        implicit = jnp.asarray(self.scene.spd_diagonal, qacc.dtype) * qacc
-        return (tau - self.scene.character_qvel(implicit))[6:]
-
     def _target_pose(self, reference: RefState, action: Array) -> Array:
         """What the policy asks for [55]: a (+) from the clip's pose or the nominal."""
         pose = reference.qpos if self.task.tracks_reference else self.nominal
@@ -285,42 +242,6 @@ class Environment:
         )
         coords = self.kinematics.coords
         return quat.oplus(coords, pose, quat.exp_map(coords, tangent))
-
-    def torque(self, carry: Substep, plan: ControlInputs) -> Array:
-        """Stable PD torques [42], N m, towards the pose asked for (+) u."""
-        scene, target = self.scene, plan.pose
-        if self.config.displace_target:
-            target = quat.oplus(self.kinematics.coords, target, carry.displacement.u)
-        return pd.torque(
-            scene.character,
-            scene.character_qpos(carry.body.qpos),
-            scene.character_qvel(carry.body.qvel),
-            target,
-            scene.timestep,
-        )
-
-    def displaced(
-        self,
-        carry: Substep,
-        plan: ControlInputs,
-        kin: physics.Kinematics,
-        forces: Forces,
-    ) -> Displacement:
-        """u and its velocity a physics step later."""
-        scene = self.scene
-        jacobian = jax.vmap(lambda p, b: physics.point_jacobian(scene, kin, p, b))
-        J = scene.character_qvel(jacobian(forces.point_w, forces.body))
-        force = jnp.where(forces.gate, forces.force_w, 0.0)
-        given = self.controller, carry.displacement, J, force, plan.alpha
-        if self.config.compliance.velocity == "measured":
-            xd = relative.velocity(scene, self.kinematics, carry, plan, J, forces)
-            return compliance.measured(*given, xd)
-
-        def mass_solve(qfrc: Array) -> Array:
-            qfrc = jax.vmap(scene.scatter_character)(qfrc)
-            return scene.character_qvel(physics.mass_solve(scene, kin, qfrc))
-
-        return compliance.algorithm_1(*given, mass_solve)
 
     def observed(self, state: EnvState) -> EnvState:
         """Fills in the features and the observation."""
