@@ -27,7 +27,7 @@ from dcc_jax.env import (
 )
 from dcc_jax.env.config import EnvConfig
 from dcc_jax.env.state import ControlInputs, EnvState, Substep, terminate_on_nonfinite
-from dcc_jax.env.substep import physics_step
+from dcc_jax.env.substep import Side, physics_step
 from dcc_jax.env.task import Forces, RootTarget, Task
 from dcc_jax.motion.reference import References, RefState
 
