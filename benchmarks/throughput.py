@@ -91,19 +91,19 @@ def displaced(
     J = jax.vmap(lambda p, b: physics.point_jacobian(scene, kin, p, b))(
         solution.contact_point_w[:forces], bodies
     )
-    config = compliance.ComplianceConfig()
-    delta_qdd = physics.mass_solve(scene, kin, jnp.sum(J * force[:, :, None], axis=1))
-    weights = jnp.asarray(scene.character.column_weight, J.dtype)
-    ud = compliance.displacement_velocity(
-        J, delta_qdd, jnp.asarray(0.16), weights, config
-    )
-    return compliance.advance(
+    controller = compliance.Controller(
+        compliance.ComplianceConfig(),
         scene.coords,
-        displacement,
-        ud,
-        compliance.acting(force),
+        scene.character.column_weight,
         scene.timestep,
-        compliance.return_stiffness(config, scene.model.nv),
+    )
+    return compliance.algorithm_1(
+        controller,
+        displacement,
+        J,
+        force,
+        jnp.asarray(0.16),
+        lambda qfrc: physics.mass_solve(scene, kin, qfrc),
     )
 
 

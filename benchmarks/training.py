@@ -44,7 +44,8 @@ from dcc_jax.config import Config, make_config  # noqa: E402
 from dcc_jax.control import pd  # noqa: E402
 from dcc_jax.env.config import CONTROL_RATE  # noqa: E402
 from dcc_jax.env.environment import Environment  # noqa: E402
-from dcc_jax.env.state import EnvState  # noqa: E402
+from dcc_jax.env.state import EnvState, Substep  # noqa: E402
+from dcc_jax.env.substep import physics_step  # noqa: E402
 from dcc_jax.learn import learner  # noqa: E402
 from dcc_jax.learn.update import chunk_size  # noqa: E402
 
@@ -80,21 +81,14 @@ def with_minibatches(config: Config, minibatches: int) -> Config:
 
 def physics_alone(environment: Environment, state: EnvState) -> EnvState:
     """The physics steps of a control step: no observation, reward or reset."""
-    scene = environment.scene
     action = jnp.zeros(environment.action_size)
-    start, plan = environment.begin(jax.random.key(0), state, action)
+    start, inputs = environment.begin(jax.random.key(0), state, action)
 
-    def substep(carry: Any, _: None) -> tuple[Any, None]:
-        world = environment.task.world(scene, carry.task, carry.time)
-        kin = physics.kinematics(scene, carry.body, world)
-        tau = environment.torque(carry, plan)
-        qfrc = scene.scatter_character(tau)
-        qfrc = qfrc + environment.task.applied(scene, carry.task, kin, carry.time)
-        solution = physics.solve(scene, kin, carry.body, qfrc)
-        return environment.react(carry, plan, kin, tau, solution)[0], None
+    def one(carry: Substep, _: None) -> tuple[Substep, None]:
+        return physics_step([environment.side], [carry], [inputs])[0][0], None
 
     steps = environment.config.control_steps
-    end, _ = jax.lax.scan(substep, start, None, length=steps)
+    end, _ = jax.lax.scan(one, start, None, length=steps)
     return state.replace(
         body=end.body, displacement=end.displacement, task=end.task, time=end.time
     )

@@ -59,7 +59,7 @@ def play(match: Match, runs: list[Run], level: float, count: int, steps: int, se
     import jax
     import jax.numpy as jnp
 
-    from dcc_jax.env.environment import ALPHA_ENTRY
+    from dcc_jax.env.observation import ALPHA_ENTRY
 
     observed_alpha = [float(np.clip(level, *run.alphas)) for run in runs]
 

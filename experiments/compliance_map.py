@@ -62,8 +62,7 @@ def pushed(scene: physics.Scene, config: compliance.ComplianceConfig):
     """A function (body, force [3], alpha) -> log u [T, 42] of one simulated push."""
     character, h = scene.character, scene.timestep
     q_m = jnp.asarray(standing(scene.model), jnp.float32)
-    weights = jnp.asarray(character.column_weight, jnp.float32)
-    k = compliance.return_stiffness(config, character.nv)
+    controller = compliance.Controller(config, scene.coords, character.column_weight, h)
     centre = jnp.asarray(scene.model.body_ipos, jnp.float32)
 
     def step(carry, time, body, force, alpha):
@@ -72,14 +71,13 @@ def pushed(scene: physics.Scene, config: compliance.ComplianceConfig):
         point = kin.body_pos[body] + quat.rotate(kin.body_quat[body], centre[body])
         J = physics.point_jacobian(scene, kin, point, body)
         f = jnp.where(time < PUSH_SECONDS, force, 0.0)
+        given = controller, displacement, J[None], f[None], alpha
         if config.velocity == "measured":
-            motion = compliance.point_velocity(J[None], state.qvel, weights)
+            displacement = compliance.measured(*given, (J @ state.qvel)[None])
         else:
-            motion = physics.mass_solve(scene, kin, J.T @ f)[None]
-        ud = compliance.displacement_velocity(J[None], motion, alpha, weights, config)
-        displacement = compliance.advance(
-            scene.coords, displacement, ud, compliance.acting(f), h, k
-        )
+            displacement = compliance.algorithm_1(
+                *given, lambda qfrc: physics.mass_solve(scene, kin, qfrc)
+            )
         q_bar = quat.oplus(scene.coords, q_m, displacement.u)
         qfrc = pd.torque(character, state.qpos, state.qvel, q_bar, h) + J.T @ f
         qfrc = qfrc + held(q_m, state, h)

@@ -34,7 +34,7 @@ import jax.numpy as jnp  # noqa: E402
 import mujoco  # noqa: E402
 
 from dcc_jax import config  # noqa: E402
-from dcc_jax.env.config import CONTROL_RATE  # noqa: E402
+from dcc_jax.character import CONTROL_RATE  # noqa: E402
 from dcc_jax.env.environment import Environment  # noqa: E402
 from dcc_jax.tasks.ball import Ball  # noqa: E402
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from dcc_jax.env.environment import ALPHA_ENTRY
+from dcc_jax.env.observation import ALPHA_ENTRY
 from dcc_jax.evaluate import report
 from dcc_jax.play import runs
 from dcc_jax.play.player import Player

@@ -161,7 +161,7 @@ def test_torque_stays_within_the_limits_and_spares_the_root(character: Character
 def test_unknown_names_and_settings_are_refused(character: Character, scene):
     with pytest.raises(ValueError, match="unknown body 'tail'"):
         scene.body("tail")
-    with pytest.raises(ValueError, match="unknown root joint 'hook'"):
+    with pytest.raises(ValueError, match="unknown joint 'hook'"):
         physics.make_scene(scene.model, character, root="hook")
     with pytest.raises(ValueError, match="newton_iterations"):
         physics.make_scene(scene.model, character, newton_iterations=0)

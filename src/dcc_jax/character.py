@@ -16,6 +16,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+CONTROL_RATE = 30  # Hz, Sec. 5.1
+CONTROL_DT = 1.0 / CONTROL_RATE  # s
+GRAVITY = 9.81  # m/s^2, MuJoCo's default
 STANDARD_MASS = 65.0  # kg, Sec. 5.1
 MASS_RANGE = (20.0, 150.0)  # kg; the paper uses 36, 65 and 85
 FEET = ("left_foot", "right_foot")
@@ -131,6 +134,7 @@ class Character:
     nq = 55
     nv = 42
     num_joints = 12
+    num_joint_dofs = 36  # of qvel, after the 6 of the root
     joint_names = tuple(joint.name for joint in JOINTS)
     body_names = BODIES
     stand_height = 0.935  # m, of the pelvis when the soles of the zero pose touch z = 0

@@ -14,9 +14,10 @@ import pytest
 from mujoco import mjx
 
 from dcc_jax import quat
-from dcc_jax.character import load_character
+from dcc_jax.character import asset_path, load_character
 from dcc_jax.control import compliance
 from dcc_jax.control.stiffness import determinant, modulated_stiffness, stiffness
+from dcc_jax.motion.clip import load_clip
 
 CHARACTER = load_character()
 MODEL = CHARACTER.spec().compile()
@@ -24,29 +25,42 @@ COORDS = quat.Coordinates.of(MODEL)
 CONFIG = compliance.ComplianceConfig()
 MEASURED = compliance.ComplianceConfig(velocity="measured")
 REST = compliance.at_rest(COORDS)
-RETURN = compliance.return_stiffness(CONFIG, MODEL.nv)
 H = CONFIG.response_time
 BATCH = 96
 STEPS = 480
 DT = 1.0 / 240.0
 
 
+def controller(weights=CHARACTER.column_weight, dt=DT):
+    """Of the character, at the default settings."""
+    return compliance.Controller(CONFIG, COORDS, weights, dt)
+
+
 @jax.jit
 @jax.vmap
 @chex.assert_max_traces(1)
-def velocity(J, delta_qdd, alpha, weights):
-    """ud [BATCH, 42] of one force in each of BATCH environments."""
-    return compliance.displacement_velocity(
-        J[None], delta_qdd[None], alpha, weights, CONFIG
+def velocity(J, inverse, force, alpha, weights):
+    """ud [BATCH, 42] of one force in each of BATCH environments, and delta_qdd."""
+    delta_qdd = []
+
+    def mass_solve(qfrc):
+        delta_qdd.append(qfrc @ inverse)
+        return delta_qdd[0]
+
+    displacement = compliance.algorithm_1(
+        controller(weights), REST, J[None], force[None], alpha, mass_solve
     )
+    return displacement.ud, delta_qdd[0][0]
 
 
 @jax.jit
 @jax.vmap
 @chex.assert_max_traces(1)
 def measured_velocity(J, xd, alpha, weights):
-    """The same from measured velocities [BATCH, 3] of the points."""
-    return compliance.displacement_velocity(J[None], xd[None], alpha, weights, MEASURED)
+    """ud [BATCH, 42] from measured velocities [BATCH, 3] of the points."""
+    return compliance.measured(
+        controller(weights), REST, J[None], jnp.ones((1, 3)), alpha, xd[None]
+    ).ud
 
 
 @jax.jit
@@ -59,26 +73,50 @@ def course(displacement, ud_forces, active_steps, dt):
 
     def step(displacement, index):
         displacement = compliance.advance(
-            COORDS, displacement, ud_forces, index < active_steps, dt, RETURN
+            controller(dt=dt), displacement, ud_forces, index < active_steps
         )
         return displacement, quat.log_map(COORDS, displacement.u)
 
     return jax.lax.scan(step, displacement, jnp.arange(STEPS))
 
 
-def pushed(q: np.ndarray, body: int, force: np.ndarray) -> tuple[np.ndarray, ...]:
-    """J [3, 42] and M^-1 J^T f [42] at the origin of a body, by C MuJoCo."""
+@dataclass(frozen=True)
+class Pushes:
+    """One push in each of BATCH environments, zeros after the last."""
+
+    J: np.ndarray  # [BATCH, 3, 42]
+    inverse: np.ndarray  # [BATCH, 42, 42] M^-1
+    force: np.ndarray  # [BATCH, 3] N
+
+    @classmethod
+    def of(cls, rows: list[tuple[np.ndarray, int, np.ndarray]]) -> Pushes:
+        """Of poses, bodies at whose origins the forces act, and forces."""
+        arrays = [(*mechanics(q, [body], False), force) for q, body, force in rows]
+        J, inverse, force = (
+            np.pad(
+                np.array(x, np.float32),
+                [(0, BATCH - len(rows))] + [(0, 0)] * (np.ndim(x) - 1),
+            )
+            for x in zip(*((J[0], Mi, f) for J, Mi, f in arrays), strict=True)
+        )
+        return cls(J, inverse, force)
+
+
+def mechanics(q: np.ndarray, bodies, centres: bool) -> tuple[np.ndarray, np.ndarray]:
+    """J [len(bodies), 3, 42] of origins or centres of mass, and M^-1, by C MuJoCo."""
     data = mujoco.MjData(MODEL)
     data.qpos[:] = q
     mujoco.mj_forward(MODEL, data)
-    J, delta_qdd = np.zeros((3, MODEL.nv)), np.zeros((1, MODEL.nv))
-    mujoco.mj_jac(MODEL, data, J, None, data.xpos[body], body)
-    mujoco.mj_solveM(MODEL, data, delta_qdd, (J.T @ force)[None])
-    return J, delta_qdd[0]
+    J, inverse = np.zeros((len(bodies), 3, MODEL.nv)), np.zeros((MODEL.nv, MODEL.nv))
+    for of, body in zip(J, bodies, strict=True):
+        point = data.xipos[body] if centres else data.xpos[body]
+        mujoco.mj_jac(MODEL, data, of, None, point, body)
+    mujoco.mj_solveM(MODEL, data, inverse, np.eye(MODEL.nv))
+    return J, inverse
 
 
-def random_pushes(seed: int, newtons: float) -> tuple[np.ndarray, np.ndarray]:
-    """J [BATCH, 3, 42] and delta_qdd [BATCH, 42] of random poses, bodies, forces."""
+def random_pushes(seed: int, newtons: float) -> Pushes:
+    """Random poses, bodies and directions."""
     rng = np.random.default_rng(seed)
     rows = []
     for _ in range(BATCH):
@@ -86,16 +124,22 @@ def random_pushes(seed: int, newtons: float) -> tuple[np.ndarray, np.ndarray]:
         mujoco.mj_integratePos(MODEL, q, rng.normal(0.0, 0.5, MODEL.nv), 1.0)
         force = rng.normal(size=3)
         force *= newtons / np.linalg.norm(force)
-        rows.append(pushed(q, int(rng.integers(1, MODEL.nbody)), force))
-    J, delta_qdd = zip(*rows, strict=True)
-    return np.array(J, np.float32), np.array(delta_qdd, np.float32)
+        rows.append((q, int(rng.integers(1, MODEL.nbody)), force))
+    return Pushes.of(rows)
 
 
-def velocities(J, motion, alpha=0.16, weights=CHARACTER.column_weight, of=velocity):
-    """`velocity` in numpy, alpha and weights spread over the batch."""
-    alphas = jnp.full(BATCH, alpha, jnp.float32)
-    spread = jnp.asarray(np.broadcast_to(weights, (BATCH, MODEL.nv)), jnp.float32)
-    return np.asarray(of(jnp.asarray(J), jnp.asarray(motion), alphas, spread))
+def spread(alpha, weights):
+    """alpha and weights for every environment."""
+    weights = np.broadcast_to(weights, (BATCH, MODEL.nv))
+    return jnp.full(BATCH, alpha, jnp.float32), jnp.asarray(weights, jnp.float32)
+
+
+def velocities(pushes: Pushes, alpha=0.16, weights=CHARACTER.column_weight):
+    """`velocity` in numpy: ud and delta_qdd [BATCH, 42]."""
+    ud, delta_qdd = velocity(
+        pushes.J, pushes.inverse, pushes.force, *spread(alpha, weights)
+    )
+    return np.asarray(ud), np.asarray(delta_qdd)
 
 
 def alone(rows: list[list[float]]) -> np.ndarray:
@@ -109,20 +153,22 @@ def test_velocity_of_a_pendulum_by_hand():
     # A point mass of 2 kg at the end of a 0.5 m rod, pushed across it with 10 N.
     length, mass, force, alpha = 0.5, 2.0, 10.0, 0.16
     J = alone([[0.0], [length], [0.0]])
-    delta_qdd = alone([[force / (mass * length)]])[:, 0]
-    ud = velocities(J, delta_qdd, alpha, np.ones(MODEL.nv))
+    inverse = np.zeros((BATCH, MODEL.nv, MODEL.nv), np.float32)
+    inverse[:, 0, 0] = 1.0 / (mass * length**2)
+    pushes = Pushes(J, inverse, np.tile(np.float32([0.0, force, 0.0]), (BATCH, 1)))
+    ud, _ = velocities(pushes, alpha, np.ones(MODEL.nv))
     exact = alpha / 600.0 * force / (mass * length)
     damped = length**2 / (length**2 + 1e-4)
-    np.testing.assert_allclose(ud[0, 0], exact * damped, rtol=1e-6)
+    np.testing.assert_allclose(ud[0, 0], exact * damped**2, rtol=1e-6)
     np.testing.assert_array_equal(ud[0, 1:], 0.0)
 
 
 def test_point_yields_by_alpha_whatever_the_weights():
-    J, _ = random_pushes(0, 100.0)
+    J = random_pushes(0, 100.0).J
     rng = np.random.default_rng(0)
     weights = rng.uniform(0.2, 3.0, (BATCH, MODEL.nv)).astype(np.float32)
     xd = rng.normal(size=(BATCH, 3)).astype(np.float32)
-    ud = velocities(J, xd, 0.3, weights, of=measured_velocity)
+    ud = measured_velocity(J, xd, *spread(0.3, weights))
     point = np.einsum("bij,bj->bi", J, ud)
     np.testing.assert_allclose(point, 0.3 * xd, atol=1e-3)
 
@@ -131,26 +177,72 @@ def test_joint_of_twice_the_weight_turns_twice_as_far():
     J = alone([[0.3, 0.3], [0.0, 0.0], [0.0, 0.0]])
     xd = np.tile(np.array([1.0, 0.0, 0.0], np.float32), (BATCH, 1))
     weights = np.r_[2.0, np.ones(MODEL.nv - 1)]
-    (twice, once), *_ = velocities(J, xd, 1.0, weights, of=measured_velocity)[:, :2]
+    twice, once = measured_velocity(J, xd, *spread(1.0, weights))[0, :2]
     assert twice == pytest.approx(2.0 * once)
     assert 0.3 * (twice + once) == pytest.approx(1.0, rel=1e-3)
 
 
 def test_columns_of_weight_zero_are_never_displaced():
-    ud = velocities(*random_pushes(1, 180.0))
+    ud, _ = velocities(random_pushes(1, 180.0))
     np.testing.assert_array_equal(ud[:, 2:6], 0.0)
     assert np.all(np.abs(ud[:, :2]).max(axis=0) > 0.0)
 
 
+def random_weights(rng: np.random.Generator) -> np.ndarray:
+    """Of the columns [42], over four decades, from none to all of them zero."""
+    weights = 10.0 ** rng.uniform(-3.0, 1.0, MODEL.nv)
+    return weights * (rng.random(MODEL.nv) < rng.random())
+
+
+@jax.jit
+def powers(J, inverse, forces, weights):
+    """f . (J ud) over its value for S = 1, at alpha = 1, [26 directions, 15 bodies]."""
+    coords = quat.Coordinates.of(MODEL)  # its own, jax caches index arrays by precision
+    rest = compliance.at_rest(coords)
+    plain = compliance.Controller(CONFIG, coords, weights, DT)
+
+    def power(J, force):
+        given = plain, rest, J[None], force[None], 1.0
+        ud = compliance.algorithm_1(*given, lambda qfrc: qfrc @ inverse).ud
+        yielding = J.T @ force
+        return force @ (J @ ud) / (H * yielding @ (inverse @ yielding))
+
+    each_body = jax.vmap(power, (0, None))
+    return jax.vmap(each_body, (None, 0))(J, forces)
+
+
+@pytest.mark.parametrize("double", [True, False])
+def test_no_body_yields_against_the_force_in_any_clip_whatever_the_weights(double):
+    rng, dtype = np.random.default_rng(9), np.float64 if double else np.float32
+    directions = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1.0
+    bodies = range(1, MODEL.nbody)
+    chest, horizontal = CHARACTER.body_names.index("chest"), directions[:, 2] == 0.0
+    with jax.enable_x64(double):
+        for path in sorted(asset_path("motions").glob("*.npz")):
+            poses = load_clip(path).qpos
+            for frame in np.linspace(0, len(poses) - 1, 4).astype(int):
+                J, inverse = mechanics(poses[frame], bodies, centres=True)
+                for weights in (CHARACTER.column_weight, random_weights(rng)):
+                    given = (J, inverse, 100.0 * directions, weights)
+                    power = np.asarray(powers(*(np.asarray(x, dtype) for x in given)))
+                    assert power.min() > (-1e-9 if double else -1e-4)
+                    if weights is CHARACTER.column_weight:
+                        assert power[horizontal, chest].min() > 0.1
+
+
 def test_forces_add_up_and_vmap_is_a_loop():
-    J, delta_qdd = random_pushes(2, 100.0)
-    weights = jnp.asarray(CHARACTER.column_weight, jnp.float32)
-    each = velocities(J, delta_qdd)
-    together = jax.jit(compliance.displacement_velocity, static_argnames="config")
+    pushes = random_pushes(2, 100.0)
+    each, _ = velocities(pushes)
+    alpha = jnp.asarray(0.16, jnp.float32)
     for first in range(0, 10, 2):
         pair = slice(first, first + 2)
+
+        def mass_solve(qfrc, inverse=pushes.inverse[pair]):
+            return jnp.einsum("fi,fij->fj", qfrc, inverse)
+
+        given = controller(), REST, pushes.J[pair], pushes.force[pair], alpha
         np.testing.assert_allclose(
-            together(J[pair], delta_qdd[pair], 0.16, weights, CONFIG),
+            compliance.algorithm_1(*given, mass_solve).ud,
             each[pair].sum(axis=0),
             rtol=1e-4,
             atol=1e-7,
@@ -158,26 +250,22 @@ def test_forces_add_up_and_vmap_is_a_loop():
 
 
 def test_velocity_by_measurement_and_by_dynamics_agree_on_the_same_motion():
-    J, delta_qdd = random_pushes(3, 100.0)
-    moved = np.where(CHARACTER.column_weight > 0.0, H * delta_qdd, 0.0)
-    xd = np.einsum("bij,bj->bi", J, moved).astype(np.float32)
-    np.testing.assert_allclose(
-        velocities(J, xd, of=measured_velocity),
-        velocities(J, delta_qdd),
-        rtol=1e-3,
-        atol=1e-6,
-    )
+    pushes = random_pushes(3, 100.0)
+    ud, delta_qdd = velocities(pushes)
+    xd = H * np.einsum("bij,bj->bi", pushes.J, delta_qdd)
+    measured = measured_velocity(pushes.J, xd, *spread(0.16, CHARACTER.column_weight))
+    np.testing.assert_allclose(measured, ud, rtol=1e-3, atol=1e-6)
 
 
 @pytest.mark.parametrize("newtons", [0.0, 1e-9, 1.0, 180.0, 1e6])
 @pytest.mark.parametrize("uneven", [False, True])
 def test_velocity_never_exceeds_alpha_h_delta_qdd(newtons, uneven):
-    J, delta_qdd = random_pushes(4, newtons)
     weights = CHARACTER.column_weight
     if uneven:
         weights = 10.0 ** np.random.default_rng(4).uniform(-2, 2, (BATCH, MODEL.nv))
-    ud = velocities(J, delta_qdd, 0.16, weights).astype(float)
-    bound = 0.16 * H * np.linalg.norm(delta_qdd.astype(float), axis=1)
+    ud, delta_qdd = velocities(random_pushes(4, newtons), 0.16, weights)
+    ud, delta_qdd = ud.astype(float), delta_qdd.astype(float)
+    bound = 0.16 * H * np.linalg.norm(delta_qdd, axis=1)
     assert np.all(np.linalg.norm(ud, axis=1) <= bound * (1.0 + 1e-5))
     assert np.all(np.any(ud != 0.0, axis=1)) == (newtons > 0.0)
 
@@ -187,20 +275,17 @@ def test_displacement_at_singular_poses_stays_finite_and_bounded(newtons):
     hand = 1 + CHARACTER.body_names.index("left_hand")
     chest = 1 + CHARACTER.body_names.index("chest")
     cases = [
-        pushed(MODEL.qpos0, hand, np.array([0.0, newtons, 0.0])),  # along the arm
-        pushed(MODEL.qpos0, chest, np.array([0.0, 0.0, newtons])),  # along the spine
-        pushed(MODEL.qpos0, 1, np.array([0.0, 0.0, newtons])),  # the root, upwards
+        (MODEL.qpos0, hand, np.array([0.0, newtons, 0.0])),  # along the arm
+        (MODEL.qpos0, chest, np.array([0.0, 0.0, newtons])),  # along the spine
+        (MODEL.qpos0, 1, np.array([0.0, 0.0, newtons])),  # the root, upwards
     ]
-    J, delta_qdd = (np.array(x, np.float32) for x in zip(*cases, strict=True))
-    padding = (-len(cases)) % BATCH
-    ud = velocities(
-        np.pad(J, ((0, padding), (0, 0), (0, 0))),
-        np.pad(delta_qdd, ((0, padding), (0, 0))),
-    )
-    for case in range(len(cases)):
-        bound = 0.16 * H * np.linalg.norm(delta_qdd[case].astype(float))
-        assert np.linalg.norm(ud[case].astype(float)) <= bound * (1.0 + 1e-5)
-        displacement, _ = course(REST, ud[case], STEPS, DT)
+    pushes = Pushes.of(cases)
+    uds, _ = velocities(pushes)
+    for case, ud in enumerate(uds[: len(cases)]):
+        delta_qdd = pushes.inverse[case] @ (pushes.J[case].T @ pushes.force[case])
+        bound = 0.16 * H * np.linalg.norm(delta_qdd.astype(float))
+        assert np.linalg.norm(ud.astype(float)) <= bound * (1.0 + 1e-5)
+        displacement, _ = course(REST, ud, STEPS, DT)
         chex.assert_tree_all_finite(displacement)
         farthest = bound * STEPS * DT
         assert np.abs(displacement.u[:3]).max() <= farthest * (1.0 + 1e-4)
@@ -209,7 +294,7 @@ def test_displacement_at_singular_poses_stays_finite_and_bounded(newtons):
 
 
 def test_level_zero_is_exactly_inert():
-    for ud in velocities(*random_pushes(5, 1e6), alpha=0.0)[:5]:
+    for ud in velocities(random_pushes(5, 1e6), alpha=0.0)[0][:5]:
         displacement, _ = course(REST, ud, STEPS // 2, DT)
         chex.assert_trees_all_equal(displacement, REST)
 
@@ -244,19 +329,32 @@ def test_only_forces_of_exactly_zero_do_not_act():
     assert compliance.acting(jnp.zeros((4, 3)).at[2, 1].set(-1e-9))
 
 
+def test_a_force_of_exactly_zero_adds_nothing_to_another():
+    pushes = random_pushes(10, 100.0)
+    forces = pushes.force[:2] * np.float32([[1.0], [0.0]])
+    xd = np.ones((2, 3), np.float32)
+    given = controller(), REST, pushes.J[:2], forces, jnp.asarray(0.16)
+    both = compliance.measured(*given, xd).ud
+    given = controller(), REST, pushes.J[:1], forces[:1], jnp.asarray(0.16)
+    np.testing.assert_allclose(both, compliance.measured(*given, xd[:1]).ud, rtol=1e-5)
+
+
 def test_step_is_the_same_without_jit():
-    J, delta_qdd = random_pushes(7, 100.0)
-    weights = jnp.asarray(CHARACTER.column_weight, jnp.float32)
-    plain_ud = compliance.displacement_velocity(
-        J[0][None], delta_qdd[0][None], 0.16, weights, CONFIG
-    )
-    together = velocities(J, delta_qdd)
-    np.testing.assert_allclose(together[0], plain_ud, rtol=1e-4, atol=1e-7)
-    plain = compliance.advance(COORDS, REST, plain_ud, True, DT, RETURN)
+    pushes = random_pushes(7, 100.0)
+    together, _ = velocities(pushes)
+    given = controller(), REST, pushes.J[:1], pushes.force[:1], 0.16
+    plain = compliance.algorithm_1(*given, lambda qfrc: qfrc @ pushes.inverse[0])
+    np.testing.assert_allclose(together[0], plain.ud, rtol=1e-4, atol=1e-7)
     _, path = course(REST, together[0], 1, DT)
     np.testing.assert_allclose(
         quat.log_map(COORDS, plain.u), path[0], rtol=1e-4, atol=1e-7
     )
+
+
+@pytest.mark.parametrize("root_dofs", [-1, MODEL.nv + 1])
+def test_a_root_of_more_columns_than_there_are_is_refused(root_dofs):
+    with pytest.raises(ValueError, match="root_dofs must be in"):
+        compliance.Controller(CONFIG, COORDS, np.ones(MODEL.nv), DT, root_dofs)
 
 
 @pytest.mark.parametrize(
@@ -329,18 +427,16 @@ ARMS = {
 
 def controllers(arm: Arm):
     """One step of the controllers of B arms: displacements, J, qvel, alpha -> q_bar."""
-    coords = quat.Coordinates.of(arm.model)
-    k = compliance.return_stiffness(MEASURED, arm.model.nv, root_dofs=0)
-    q_m, dt = jnp.asarray(arm.q_m, jnp.float32), arm.model.opt.timestep
+    coords, dt = quat.Coordinates.of(arm.model), arm.model.opt.timestep
+    of_arm = compliance.Controller(MEASURED, coords, arm.weights, dt, root_dofs=0)
+    q_m = jnp.asarray(arm.q_m, jnp.float32)
 
     def step(displacement, J, qvel, alpha):
-        xd = compliance.point_velocity(J[None], qvel, arm.weights)
-        ud = compliance.displacement_velocity(J[None], xd, alpha, arm.weights, MEASURED)
-        displacement = compliance.advance(coords, displacement, ud, True, dt, k)
+        given = of_arm, displacement, J[None], jnp.ones((1, 3)), alpha
+        displacement = compliance.measured(*given, (J @ qvel)[None])
         return displacement, quat.oplus(coords, q_m, displacement.u)
 
-    start = compliance.at_rest(coords)
-    return start, jax.jit(jax.vmap(step))
+    return compliance.at_rest(coords), jax.jit(jax.vmap(step))
 
 
 def simulated_rest(arm: Arm, forces: np.ndarray, levels: np.ndarray) -> np.ndarray:

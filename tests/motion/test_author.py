@@ -5,10 +5,10 @@ import pytest
 from inverse import effort
 from scipy.spatial.transform import Rotation
 
-from dcc_jax.character import asset_path, load_character
+from dcc_jax.character import GRAVITY, asset_path, load_character
 from dcc_jax.motion.clip import load_clip, save_clip, velocities
 from tools.author_clips import door
-from tools.author_clips.kinematics import GRAVITY, Pose, angular_velocity, momentum
+from tools.author_clips.kinematics import Pose, angular_velocity, momentum
 from tools.author_clips.recipes import RECIPES, author, clip_names
 from tools.author_clips.steps import SOLE_RADIUS, sole_spheres
 

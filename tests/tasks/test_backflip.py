@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from dcc_jax import physics
-from dcc_jax.character import asset_path, compose_scene, load_character
+from dcc_jax.character import CONTROL_DT, asset_path, compose_scene, load_character
 from dcc_jax.config import make_config
 from dcc_jax.motion.clip import load_clip
-from dcc_jax.motion.reference import CONTROL_DT, make_references
+from dcc_jax.motion.reference import make_references
 from dcc_jax.tasks.backflip import Backflip
 from dcc_jax.tasks.trampoline import Trampoline
 from dcc_jax.training import loop
@@ -149,7 +149,7 @@ def test_clips_are_files_or_names_of_the_packages_own():
     np.testing.assert_array_equal(environment.references.frames, frames)
     # A crouch of the clips is no fall.
     lowest = environment.references.qpos[..., 2].min()
-    assert lowest < 0.55 and environment.fall_height == pytest.approx(lowest - 0.1)
+    assert lowest < 0.55 and environment.fallen.pelvis == pytest.approx(lowest - 0.1)
     env = dataclasses.replace(config.env, clips=("handstand",))
     with pytest.raises(FileNotFoundError, match="handstand"):
         loop.make_environment(dataclasses.replace(config, env=env))

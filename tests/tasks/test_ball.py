@@ -98,7 +98,7 @@ def pinned(character: Character) -> physics.Scene:
 def tipping(pinned) -> np.ndarray:
     """Angle of the pole from the vertical every physics step, from 0.1 rad, [T]."""
     start = jnp.asarray(pinned.model.qpos0, jnp.float32)
-    q_adr, _ = ball._pole(pinned)
+    q_adr, _ = pinned.address("pole")
     head = pinned.model.body("head").id
     data = mujoco.MjData(pinned.model)
     mujoco.mj_kinematics(pinned.model, data)
@@ -139,7 +139,7 @@ def test_a_push_changes_the_balls_velocity_and_not_the_pivots(environment):
     scene = environment.scene
     reference = environment.references.state_at(0, 1.0)
     _, qpos, qvel = TASK.reset(jax.random.key(0), scene, reference)
-    q_adr, _ = ball._pole(scene)
+    q_adr, _ = scene.address("pole")
     leaning = quat.exp(jnp.array([0.3, -0.2, 0.1]))
     qpos = qpos.at[q_adr + 3 : q_adr + 7].set(leaning)
     body = physics.initial_state(scene, qpos, qvel)
@@ -180,7 +180,7 @@ def test_reward_falls_with_the_balls_offset_from_the_head(environment, lean):
     scene = environment.scene
     reference = environment.references.state_at(0, 1.0)
     _, qpos, qvel = TASK.reset(jax.random.key(0), scene, reference)
-    q_adr, _ = ball._pole(scene)
+    q_adr, _ = scene.address("pole")
     turn = quat.exp(jnp.array([0.0, lean, 0.0]))
     body = physics.initial_state(scene, qpos.at[q_adr + 3 : q_adr + 7].set(turn), qvel)
     data = mujoco.MjData(scene.model)
@@ -197,7 +197,7 @@ def test_reward_falls_with_the_balls_offset_from_the_head(environment, lean):
 def test_the_ball_is_lost_when_the_pole_leans_too_far(environment):
     scene = environment.scene
     qpos = jnp.asarray(scene.model.qpos0, jnp.float32)
-    q_adr, _ = ball._pole(scene)
+    q_adr, _ = scene.address("pole")
     for lean, lost in ((TASK.dropped - 0.05, False), (TASK.dropped + 0.05, True)):
         turn = quat.exp(jnp.array([0.6, 0.8, 0.0]) * lean)
         body = physics.initial_state(
@@ -210,7 +210,7 @@ def test_what_is_observed_does_not_depend_on_place_and_heading(environment):
     scene, model = environment.scene, environment.scene.model
     reference = environment.references.state_at(0, 1.0)
     _, qpos, qvel = TASK.reset(jax.random.key(0), scene, reference)
-    q_adr, v_adr = ball._pole(scene)
+    q_adr, v_adr = scene.address("pole")
     qvel = qvel.at[v_adr : v_adr + 6].set(jnp.array([0.3, -0.2, 0.1, 0.5, 0.7, 0.0]))
     here = TASK.observe(scene, None, physics.initial_state(scene, qpos, qvel))
     turn = quat.exp(jnp.array([0.0, 0.0, 1.1]))

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from dcc_jax import config, physics
-from dcc_jax.character import asset_path, compose_scene, load_character
+from dcc_jax.character import CONTROL_DT, asset_path, compose_scene, load_character
 from dcc_jax.motion.clip import load_clip
-from dcc_jax.motion.reference import CONTROL_DT, make_references
+from dcc_jax.motion.reference import make_references
 from dcc_jax.tasks import chicken_fight
 from dcc_jax.tasks.chicken_fight import HALF_SIZE, LONG, ChickenFight
 from dcc_jax.training import loop

@@ -11,7 +11,8 @@ import pytest
 from dcc_jax import physics
 from dcc_jax.character import Character, asset_path, compose_scene
 from dcc_jax.env.config import EnvConfig
-from dcc_jax.env.environment import PHASE_SIZE, Environment
+from dcc_jax.env.environment import Environment
+from dcc_jax.env.observation import PHASE_SIZE
 from dcc_jax.motion.clip import Clip, load_clip
 from dcc_jax.motion.reference import make_references
 from dcc_jax.tasks import door

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from dcc_jax import physics, quat
-from dcc_jax.character import asset_path, compose_scene, load_character
+from dcc_jax.character import CONTROL_DT, asset_path, compose_scene, load_character
 from dcc_jax.motion import paths
 from dcc_jax.motion.clip import load_clip
-from dcc_jax.motion.reference import CONTROL_DT, References, RefState, make_references
+from dcc_jax.motion.reference import References, RefState, make_references
 from dcc_jax.tasks import hand_in_hand
 from dcc_jax.tasks.hand_in_hand import HandInHand
 

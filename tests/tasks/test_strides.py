@@ -8,10 +8,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from dcc_jax.character import asset_path, compose_scene, load_character
+from dcc_jax.character import CONTROL_DT, asset_path, compose_scene, load_character
 from dcc_jax.motion import planner
 from dcc_jax.motion.clip import load_clip
-from dcc_jax.motion.reference import CONTROL_DT, References, make_references
+from dcc_jax.motion.paths import Motion
+from dcc_jax.motion.reference import References, make_references
 from dcc_jax.tasks.hand_in_hand import HandInHand
 
 PHASES = np.arange(48) / 48
@@ -118,3 +119,37 @@ def test_what_it_begins_with_moves_as_it_says(references, loops, speed):
 def test_clips_that_make_no_planner_are_refused(names, reason):
     with pytest.raises(ValueError, match=reason):
         planner.strides(_references(*names))
+
+
+def test_the_velocity_as_it_goes_on_is_that_of_its_poses(references, loops):
+    """Running in a curve, for as long as the path of one control step is an arc."""
+    speed, turn, zero = jnp.array(2.6), jnp.array(0.4), jnp.zeros(())
+    motion = Motion(
+        time=zero,
+        position=jnp.zeros(2),
+        heading=zero,
+        speed=speed,
+        acceleration=zero,
+        turn=turn,
+        wanted_speed=speed,
+        wanted_turn=turn,
+        left=zero,
+    )
+
+    @jax.jit
+    def run(first):
+        def step(at, _):
+            later = planner.go_on(references, loops, motion, at, CONTROL_DT)
+            return later, later
+
+        return jax.lax.scan(step, first, None, length=6)[1]
+
+    first = planner.begin(references, loops, jnp.array(0.3), speed, CONTROL_DT)
+    path = jax.tree.map(lambda x: np.array(x, float), run(first))
+    model = compose_scene(load_character(), floor=False)
+    rate = np.zeros(42)
+    for i in range(1, 5):
+        before, after = path.qpos[i - 1], path.qpos[i + 1]
+        mujoco.mj_differentiatePos(model, rate, 2.0 * CONTROL_DT, before, after)
+        np.testing.assert_allclose(path.qvel[i], rate, atol=5e-3)
+    assert np.abs(path.qvel[:, 6:]).max() > 3.0

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from dcc_jax import physics
-from dcc_jax.character import asset_path, load_character
+from dcc_jax.character import CONTROL_DT, asset_path, load_character
 from dcc_jax.motion import paths
 from dcc_jax.motion.clip import load_clip
-from dcc_jax.motion.reference import CONTROL_DT, make_references, planar_moved
+from dcc_jax.motion.reference import make_references, planar_moved
 from dcc_jax.tasks.sustained_push import SustainedPush, SustainedPushState
 
 TASK = SustainedPush()

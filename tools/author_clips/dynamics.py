@@ -16,8 +16,8 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 from scipy.sparse import coo_array, diags_array, eye_array, kron, vstack
 from scipy.sparse.linalg import spsolve
 
+from dcc_jax.character import GRAVITY
 from tools.author_clips.kinematics import (
-    GRAVITY,
     HIPS,
     RIGHT_ELBOW,
     RIGHT_SHOULDER,

@@ -7,8 +7,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from dcc_jax.character import GRAVITY
 from tools.author_clips.dynamics import Solved, solve
-from tools.author_clips.kinematics import ANKLE_HEIGHT, GRAVITY
+from tools.author_clips.kinematics import ANKLE_HEIGHT
 from tools.author_clips.stand import SIDES, home
 from tools.author_clips.steps import Foothold, bump, ramp
 from tools.author_clips.style import (

@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dcc_jax.character import GRAVITY
 from tools.author_clips.dynamics import Plan, Solved, solve
-from tools.author_clips.kinematics import GRAVITY, about
+from tools.author_clips.kinematics import about
 from tools.author_clips.stand import home
 from tools.author_clips.steps import Foothold, brisk, foot_track
 from tools.author_clips.style import RATE, arms, height_path, keyed, stand_height, times

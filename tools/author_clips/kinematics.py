@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from dcc_jax.character import JOINTS, load_character
 
-GRAVITY = 9.81  # m/s^2, MuJoCo's default
 THIGH, SHIN = 0.4, 0.4  # m, assets/character.xml
 HIPS = np.array([[0.0, 0.085, -0.06], [0.0, -0.085, -0.06]])  # m, in the pelvis
 UPPER_ARM, PALM = 0.28, 0.325  # m, shoulder to elbow, elbow to middle of the hand

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dcc_jax.character import GRAVITY
 from tools.author_clips.dynamics import Solved, cropped, solve
 from tools.author_clips.gaits import Step, stride_holds
-from tools.author_clips.kinematics import GRAVITY
 from tools.author_clips.stand import SIDES
 from tools.author_clips.steps import Foothold, ramp
 from tools.author_clips.style import (

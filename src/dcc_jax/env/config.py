@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from dcc_jax.character import CONTROL_RATE
 from dcc_jax.control.compliance import ComplianceConfig
 from dcc_jax.env.rewards import RewardConfig
-
-CONTROL_RATE = 30  # Hz, Sec. 5.1
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,8 @@
-"""One environment: forces, compliance, PD, physics, features, rewards.
+"""One environment: a task, a character and its reference, step by step.
 
-A control step is `control_steps` physics steps of
-
-    kinematics -> PD torques (Eq. 2) -> MJX -> external forces -> u (Alg. 1) -> advance,
-
-then the state (Sec. 4.2), the positional and the task reward (Eq. 14), and whether the
-episode ends. It knows no task and no discriminator; both come from outside.
+A control step is `control_steps` physics steps (`env.substep`), then the state (Sec.
+4.2), the positional and the task reward (Eq. 14), and whether the episode ends. It
+knows no task and no discriminator; both come from outside.
 """
 
 from __future__ import annotations
@@ -15,27 +12,34 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from dcc_jax import physics, quat
-from dcc_jax.character import Character, compose_scene
-from dcc_jax.control import compliance, pd
-from dcc_jax.control.compliance import Displacement
-from dcc_jax.env import features, metrics, pairs, rewards
-from dcc_jax.env.config import CONTROL_RATE, EnvConfig
+from dcc_jax.character import CONTROL_DT, Character, compose_scene
+from dcc_jax.control import compliance
+from dcc_jax.env import (
+    expert,
+    features,
+    metrics,
+    observation,
+    outcome,
+    pairs,
+    rewards,
+)
+from dcc_jax.env.config import EnvConfig
 from dcc_jax.env.state import ControlInputs, EnvState, Substep, terminate_on_nonfinite
+from dcc_jax.env.substep import Side, physics_step
 from dcc_jax.env.task import Forces, RootTarget, Task
 from dcc_jax.motion.reference import References, RefState
 
 Array = jax.Array
 
-CROUCH_MARGIN = 0.1  # m, by which the pelvis may be lower than in the clips
-ALPHA_ENTRY = 270 + 36 + 4  # of the observation, where alpha is
-PHASE_SIZE = 3  # of the observation, where the reference is followed in time
-
 
 class Environment:
-    """Static parts of one task's environment; its methods are pure."""
+    """Static parts of one task's environment; its methods are pure.
+
+    Raises:
+        ValueError: measured velocities where the reference is not followed in time.
+    """
 
     def __init__(
         self,
@@ -44,6 +48,7 @@ class Environment:
         references: References,
         config: EnvConfig,
     ) -> None:
+        _check_velocity(task, config)
         self.task = task
         self.config = config
         self.references = references
@@ -58,28 +63,21 @@ class Environment:
         )
         alone = compose_scene(character, floor=False)
         self.kinematics = features.Kinematics.of(alone)
-        self.nominal = jax.jit(_nominal_pose)(references)
-        self.return_stiffness = compliance.return_stiffness(
-            config.compliance, character.nv
+        self.nominal = jax.jit(expert.nominal_pose)(references)
+        self.controller = compliance.Controller(
+            config.compliance,
+            self.kinematics.coords,
+            character.column_weight,
+            self.scene.timestep,
         )
-        lowest = float(references.qpos[..., 2].min())
-        self.fall_height = min(config.fall_height, lowest - CROUCH_MARGIN)
-        names = [character.body_names[i] for i in range(len(character.body_names))]
-        self.limbs = np.array(
-            [i for i, n in enumerate(names) if not n.endswith(("foot", "shin"))]
-        )
-        joints = character.kp > 0.0
-        lag = float(np.mean(character.kv[joints] / character.kp[joints]))
-        self.expert_lead = 0.5 * self.control_dt + lag
-        self.action_size = 36 + task.extra_actions
-        phase_size = PHASE_SIZE if task.tracks_reference else 0
-        self.observation_size = 270 + 36 + 4 + 1 + phase_size + task.state_size
-        self.feature_size = 270
+        self.fallen = outcome.FallTest.of(config, references)
+        self.expert_lead = expert.lead(character, CONTROL_DT)
+        self.action_size = character.num_joint_dofs + task.extra_actions
+        self.observation_size = observation.size(task)
+        self.feature_size = features.FEATURE_SIZE
         self.condition_size = 0
         self.has_task_reward = task.has_reward
         self.tracks_reference = task.tracks_reference
-
-    control_dt = 1.0 / CONTROL_RATE
 
     def reset(self, key: Array, alpha: Array | None = None) -> EnvState:
         """A new episode at a moment of the reference (Reference State Initialization).
@@ -139,14 +137,25 @@ class Environment:
     def _step(
         self, key: Array, state: EnvState, action: Array, record: bool
     ) -> tuple[EnvState, Any]:
-        def substep(carry: Substep, _: None) -> tuple[Substep, Forces | None]:
-            carry, forces = self._substep(carry, plan)
+        def one(carry: Substep, _: None) -> tuple[Substep, Forces | None]:
+            ((carry, forces),) = physics_step([self.side], [carry], [inputs])
             return carry, forces if record else None
 
-        start, plan = self.begin(key, state, action)
+        start, inputs = self.begin(key, state, action)
         steps = self.config.control_steps
-        end, forces = jax.lax.scan(substep, start, None, length=steps)
-        return self.end(state, plan, end), forces
+        end, forces = jax.lax.scan(one, start, None, length=steps)
+        return self.end(state, inputs, end), forces
+
+    @property
+    def side(self) -> Side:
+        """What a physics step needs of this environment."""
+        return Side(
+            self.scene,
+            self.task,
+            self.kinematics,
+            self.controller,
+            self.config.displace_target,
+        )
 
     def begin(
         self, key: Array, state: EnvState, action: Array
@@ -157,9 +166,11 @@ class Environment:
         pose = self._target_pose(reference, action)
         sums = metrics.no_sums(state.alpha)
         start = Substep(body, state.displacement, task, state.time, sums)
-        return start, ControlInputs(action, pose, state.alpha, reference)
+        return start, ControlInputs(
+            action, pose, state.alpha, state.reference, reference, state.time
+        )
 
-    def end(self, state: EnvState, plan: ControlInputs, end: Substep) -> EnvState:
+    def end(self, state: EnvState, inputs: ControlInputs, end: Substep) -> EnvState:
         """The state after a control step, by that before it and its last substep."""
         new = dataclasses.replace(
             state,
@@ -167,7 +178,7 @@ class Environment:
             displacement=end.displacement,
             task=end.task,
             time=end.time,
-            reference=plan.reference,
+            reference=inputs.reference,
             q_previous=self.scene.character_qpos(state.body.qpos),
             u_previous=state.displacement.u,
             previous_features=state.features,
@@ -182,33 +193,22 @@ class Environment:
 
     def expert_pairs(self, key: Array, n: int) -> tuple[Array, Array, Array]:
         """(s, s') ~ M: features [n, 270] twice, and the condition [n, 0]."""
-        windows = self.references.sample_windows(key, n)
-        pair = jax.vmap(lambda q, before: self._features(q, before))
-        return (
-            pair(windows[:, 1], windows[:, 0]),
-            pair(windows[:, 2], windows[:, 1]),
-            jnp.zeros((n, 0)),
-        )
+        s, s_next = expert.pairs(self.kinematics, self.references, key, n)
+        return s, s_next, jnp.zeros((n, 0))
 
     def expert_action(self, key: Array) -> tuple[Array, Array]:
-        """A moment of the clips and what leads on from there: obs [O], action [A].
-
-        The action asks for the clip's pose half a control step and kv / kp later: a PD
-        with its target at rest lags by that much behind a steady motion.
-        """
-        state = self.reset(key)
+        """A moment of the clips and what leads on from there: obs [O], action [A]."""
+        state, task = self.reset(key), self.task
         at = state.reference
-        ahead = self.task.reference(self.references, state.task, at, self.expert_lead)
-        follows = self.task.tracks_reference
+        ahead = task.reference(self.references, state.task, at, self.expert_lead)
+        follows = task.tracks_reference
         base = self._following(at, state.task).qpos if follows else self.nominal
-        _, wanted = self.kinematics.coords.split_q(ahead.qpos)
-        _, offered = self.kinematics.coords.split_q(base)
-        turn = quat.log(quat.mul(quat.inv(offered), wanted))[1:]
-        return state.obs, jnp.pad(turn.reshape(-1), (0, self.task.extra_actions))
+        turn = expert.action(self.kinematics, base, ahead.qpos)
+        return state.obs, jnp.pad(turn, (0, task.extra_actions))
 
     def style_coordinates(self, s: Array, s_next: Array) -> Array:
         """Pairs of features [..., 270] as points [..., 225] in m (`learn.style`)."""
-        return pairs.pair_coordinates(s, s_next, self.control_dt)
+        return pairs.pair_coordinates(s, s_next, CONTROL_DT)
 
     def _drawn(self, key: Array) -> tuple[RefState, RefState]:
         """The moment of the reference an episode begins at, and the start beside it."""
@@ -226,10 +226,7 @@ class Environment:
         """The reference a control step later, where it is followed in time."""
         if not self.task.tracks_reference:
             return reference
-        return self.task.reference(self.references, task, reference, self.control_dt)
-
-    def _features(self, q: Array, q_previous: Array) -> Array:
-        return features.body_features(self.kinematics, q, q_previous)
+        return self.task.reference(self.references, task, reference, CONTROL_DT)
 
     def _alpha(self, key: Array) -> Array:
         low, high = self.config.alpha, self.config.alpha_max
@@ -237,130 +234,21 @@ class Environment:
             return jnp.asarray(low)
         return jax.random.uniform(key, minval=low, maxval=high)
 
-    def _substep(self, carry: Substep, plan: ControlInputs) -> tuple[Substep, Forces]:
-        scene, task = self.scene, self.task
-        world = task.world(scene, carry.task, carry.time)
-        kin = physics.kinematics(scene, carry.body, world)
-        tau = self.torque(carry, plan)
-        qfrc = scene.scatter_character(tau)
-        qfrc = qfrc + task.applied(scene, carry.task, kin, carry.time)
-        solution = physics.solve(scene, kin, carry.body, qfrc)
-        return self.react(carry, plan, kin, tau, solution)
-
-    def react(
-        self,
-        carry: Substep,
-        plan: ControlInputs,
-        kin: physics.Kinematics,
-        tau: Array,
-        solution: physics.Solution,
-    ) -> tuple[Substep, Forces]:
-        """A physics step later: what the solution does to body and displacement.
-
-        Args:
-            carry: at the beginning of the physics step.
-            plan: of the control step.
-            kin: at the beginning of the physics step.
-            tau: torques applied to the character [42], from `torque`.
-            solution: accelerations and forces under them.
-        """
-        scene, task = self.scene, self.task
-        task_state, forces = task.forces(scene, carry.task, kin, solution, plan.action)
-        displacement = self._displaced(carry, kin, forces, plan.alpha)
-        sums = metrics.add(
-            carry.sums,
-            jnp.where(forces.gate, forces.force_w, 0.0),
-            self._felt(tau, solution.qacc),
-            scene.character_qvel(carry.body.qvel)[6:],
-            scene.timestep,
-        )
-        return Substep(
-            body=physics.integrate(scene, carry.body, solution),
-            displacement=displacement,
-            task=task_state,
-            time=carry.time + scene.timestep,
-            sums=sums,
-        ), forces
-
-    def _felt(self, tau: Array, qacc: Array) -> Array:
-        """Torques [36] of the joints: tau less the stable PD's implicit h kv qacc."""
-        implicit = jnp.asarray(self.scene.spd_diagonal, qacc.dtype) * qacc
-        return (tau - self.scene.character_qvel(implicit))[6:]
-
     def _target_pose(self, reference: RefState, action: Array) -> Array:
         """What the policy asks for [55]: a (+) from the clip's pose or the nominal."""
         pose = reference.qpos if self.task.tracks_reference else self.nominal
-        tangent = jnp.concatenate([jnp.zeros(6, action.dtype), action[:36]])
+        tangent = jnp.concatenate(
+            [jnp.zeros(6, action.dtype), action[: Character.num_joint_dofs]]
+        )
         coords = self.kinematics.coords
         return quat.oplus(coords, pose, quat.exp_map(coords, tangent))
 
-    def torque(self, carry: Substep, plan: ControlInputs) -> Array:
-        """Stable PD torques [42], N m, towards the pose asked for (+) u."""
-        scene, target = self.scene, plan.pose
-        if self.config.displace_target:
-            target = quat.oplus(self.kinematics.coords, target, carry.displacement.u)
-        return pd.torque(
-            scene.character,
-            scene.character_qpos(carry.body.qpos),
-            scene.character_qvel(carry.body.qvel),
-            target,
-            scene.timestep,
-        )
-
-    def _displaced(
-        self, carry: Substep, kin: physics.Kinematics, forces: Forces, alpha: Array
-    ) -> Displacement:
-        """Alg. 1 for one physics step."""
-        scene, config = self.scene, self.config.compliance
-        jacobian = jax.vmap(lambda p, b: physics.point_jacobian(scene, kin, p, b))
-        J = jacobian(forces.point_w, forces.body)
-        force = jnp.where(forces.gate, forces.force_w, 0.0)
-        if config.velocity == "forward_dynamics":
-            qfrc = jnp.sum(J * force[:, :, None], axis=1)
-            motion = scene.character_qvel(physics.mass_solve(scene, kin, qfrc))
-        else:
-            weights = jnp.asarray(scene.character.column_weight, J.dtype)
-            acts = jnp.any(force != 0.0, axis=-1, keepdims=True)
-            qvel = scene.character_qvel(carry.body.qvel)
-            motion = acts * compliance.point_velocity(
-                scene.character_qvel(J), qvel, weights
-            )
-        ud = compliance.displacement_velocity(
-            scene.character_qvel(J),
-            motion,
-            alpha,
-            jnp.asarray(scene.character.column_weight, J.dtype),
-            config,
-        )
-        return compliance.advance(
-            self.kinematics.coords,
-            carry.displacement,
-            ud,
-            compliance.acting(force),
-            scene.timestep,
-            self.return_stiffness,
-        )
-
     def observed(self, state: EnvState) -> EnvState:
         """Fills in the features and the observation."""
-        q = self.scene.character_qpos(state.body.qpos)
-        numbers = features.state(
-            self.kinematics, q, state.q_previous, state.displacement.u, state.u_previous
-        )
-        target = self._root_target(state)
-        offset = target.position + state.displacement.u[:2] - q[:2]
-        obs = jnp.concatenate(
-            [
-                numbers,
-                _seen_from(q, offset),
-                _seen_from(q, target.velocity),
-                state.alpha[None],
-                self._phase(state),
-                self.task.observe(self.scene, state.task, state.body),
-            ]
+        obs, body_features = observation.observation(
+            self.task, self.scene, self.kinematics, state, self._root_target(state)
         )
         first = state.time == 0.0
-        body_features = numbers[:270]
         return dataclasses.replace(
             state,
             obs=obs,
@@ -368,81 +256,51 @@ class Environment:
             previous_features=jnp.where(first, body_features, state.previous_features),
         )
 
-    def _phase(self, state: EnvState) -> Array:
-        """The reference's phase [3] where it is followed in time, else [0].
-
-        As it is, and as a point of the circle, where a stride's end is its beginning.
-        """
-        if not self.task.tracks_reference:
-            return jnp.zeros(0)
-        phase = state.reference.phase
-        turn = 2.0 * jnp.pi * phase
-        return jnp.stack([phase, jnp.cos(turn), jnp.sin(turn)])
+    def _judged(self, state: EnvState) -> EnvState:
+        """Fills in rewards and endings."""
+        scene, task, config = self.scene, self.task, self.config
+        q = scene.character_qpos(state.body.qpos)
+        qd = scene.character_qvel(state.body.qvel)
+        target = self._root_target(state)
+        ground = task.ground_height(scene, state.task, state.body)
+        r_q, over = jnp.zeros(()), state.time >= config.episode_seconds - 1e-4
+        if task.tracks_reference:
+            r_q = outcome.tracking(
+                self.kinematics,
+                q,
+                state.displacement.u,
+                state.reference.qpos,
+                config.reward,
+            )
+            over |= outcome.clip_ended(self.references, state.reference)
+        return dataclasses.replace(
+            state,
+            r_q=r_q,
+            r_p=rewards.position_reward(
+                q[:2] - target.position,
+                qd[:2] - target.velocity,
+                state.displacement.u[:2],
+                state.displacement.ud[:2],
+                config.reward,
+            ),
+            r_task=task.reward(scene, state.task, state.body),
+            terminated=self.fallen(self.kinematics, q, ground)
+            | task.terminated(scene, state.task, state.body),
+            truncated=over,
+        )
 
     def _root_target(self, state: EnvState) -> RootTarget:
         if self.task.tracks_reference:
             return RootTarget(state.reference.qpos[:2], state.reference.qvel[:2])
         return self.task.root_target(self.scene, state.task, state.start, state.time)
 
-    def _judged(self, state: EnvState) -> EnvState:
-        """Fills in rewards and endings."""
-        scene, config = self.scene, self.config
-        q = scene.character_qpos(state.body.qpos)
-        qd = scene.character_qvel(state.body.qvel)
-        target = self._root_target(state)
-        r_p = rewards.position_reward(
-            q[:2] - target.position,
-            qd[:2] - target.velocity,
-            state.displacement.u[:2],
-            state.displacement.ud[:2],
-            config.reward,
+
+def _check_velocity(task: Task, config: EnvConfig) -> None:
+    if config.compliance.velocity == "measured" and not task.tracks_reference:
+        raise ValueError(
+            "env.compliance.velocity must be 'forward_dynamics' for task "
+            f"{task.name!r}, which follows no reference in time, got 'measured'"
         )
-        ground = self.task.ground_height(scene, state.task, state.body)
-        pos_w, _ = features.body_poses(self.kinematics, q)
-        fallen = (q[2] < ground + self.fall_height) | jnp.any(
-            pos_w[self.limbs, 2] < ground + config.limb_clearance
-        )
-        failed = self.task.terminated(scene, state.task, state.body)
-        return dataclasses.replace(
-            state,
-            r_q=self._tracking(state, q),
-            r_p=r_p,
-            r_task=self.task.reward(scene, state.task, state.body),
-            terminated=fallen | failed,
-            truncated=self._over(state),
-        )
-
-    def _tracking(self, state: EnvState, q: Array) -> Array:
-        """How well q (-) u follows the clip in time, where it does."""
-        if not self.task.tracks_reference:
-            return jnp.zeros(())
-        coords = self.kinematics.coords
-        _, here = coords.split_q(quat.ominus(coords, q, state.displacement.u))
-        _, there = coords.split_q(state.reference.qpos)
-        error = quat.log(quat.mul(quat.inv(there), here))
-        return rewards.tracking_reward(error, self.config.reward)
-
-    def _over(self, state: EnvState) -> Array:
-        """Whether the time is up, or the clip that is followed at its end."""
-        late = state.time >= self.config.episode_seconds - 1e-4
-        if not self.task.tracks_reference:
-            return late
-        at = state.reference
-        ended = at.time >= self.references.duration[at.clip] - 1e-4
-        return late | (ended & ~self.references.loop[at.clip])
-
-
-def _nominal_pose(references: References) -> Array:
-    """The pose [55] that the zero action asks for: mean joint rotations of the clips.
-
-    Departure: the paper's action is q_bar itself. Around the mean pose the untrained
-    policy stands about like the clips do, and the rotation vectors stay small.
-    """
-    frames = jnp.arange(references.qpos.shape[1]) < references.frames[:, None]
-    tangents = quat.log_map(references.coords, references.qpos)
-    weight = frames[..., None] / frames.sum()
-    mean = jnp.sum(weight * tangents, axis=(0, 1)).at[:6].set(0.0)
-    return quat.exp_map(references.coords, mean)
 
 
 def _at_origin(reference: RefState) -> RefState:
@@ -452,15 +310,9 @@ def _at_origin(reference: RefState) -> RefState:
 
 def _moved(reference: RefState, away: Array) -> RefState:
     """The same moment, elsewhere by [2] m over the ground."""
-    shift = jnp.zeros(55).at[:2].set(away)
+    shift = jnp.zeros_like(reference.qpos).at[:2].set(away)
     return dataclasses.replace(
         reference,
         qpos=reference.qpos + shift,
         qpos_previous=reference.qpos_previous + shift,
     )
-
-
-def _seen_from(q: Array, vector: Array) -> Array:
-    """A vector [2] on the ground in the local frame of the character's q [55]."""
-    _, heading = features.local_frame(q)
-    return quat.rotate(quat.inv(heading), jnp.append(vector, 0.0))[:2]

@@ -22,12 +22,16 @@ import mujoco
 import numpy as np
 
 from dcc_jax import quat
-from dcc_jax.character import BODIES, compose_scene, load_character
+from dcc_jax.character import BODIES, Character, compose_scene, load_character
 
 Array = jax.Array
 
 BODY_FEATURE_SIZE = 18
 """Numbers a body contributes: position now and then, two columns now and then."""
+FEATURE_SIZE = BODY_FEATURE_SIZE * len(BODIES)
+"""What the discriminator sees of a state, 270."""
+STATE_SIZE = FEATURE_SIZE + Character.num_joint_dofs
+"""What the policy sees of it, 306 (Sec. 4.2)."""
 
 # Row 4 i + j holds the product of the basis quaternions i and j.
 _PRODUCT = np.array(

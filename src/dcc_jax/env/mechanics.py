@@ -14,13 +14,12 @@ import mujoco
 import numpy as np
 
 from dcc_jax import quat
-from dcc_jax.character import Character, compose_scene, sole_names
+from dcc_jax.character import GRAVITY, Character, compose_scene, sole_names
 from dcc_jax.env import features
 from dcc_jax.env.features import Kinematics
 
 Array = jax.Array
 
-GRAVITY = 9.81  # m/s^2
 TOUCH = 0.005  # m, a sole's sphere closer than this to the ground stands on it
 
 

@@ -16,8 +16,8 @@ Array = jax.Array
 class Metrics:
     """Of one control step.
 
-    Forces are those that the compliance hears; while a task's gate is closed there are
-    none. Torques are what the joints feel, the stable PD's implicit part included.
+    Forces are those passed to the compliance controller; while a task's gate is closed
+    there are none. Torques include the stable PD's implicit damping term.
     """
 
     force_peak: Array  # [] N, largest norm of all forces together
@@ -63,7 +63,7 @@ def add(sums: Sums, force: Array, torque: Array, speed: Array, h: float) -> Sums
 
     Args:
         sums: before it.
-        force: that the compliance hears [F, 3], N.
+        force: passed to the compliance controller [F, 3], N.
         torque: of the joints' axes [36], N m.
         speed: of the same axes [36], rad/s.
         h: physics step, s.

@@ -51,7 +51,9 @@ class ControlInputs:
     action: Array  # [A]
     pose: Array  # [55] that the policy asks for
     alpha: Array  # []
-    reference: RefState  # at the end of the control step
+    reference_before: RefState  # at the beginning of the control step
+    reference: RefState  # at its end
+    time: Array  # [] s since the reset, at its beginning
 
 
 @flax.struct.dataclass

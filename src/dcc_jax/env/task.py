@@ -2,7 +2,8 @@
 
 A task is a frozen dataclass that derives from `Task` and overrides what it needs; the
 defaults describe a character alone on the floor. `docs/tasks.md` walks through one.
-Letters: F forces the compliance reacts to, S numbers of the task's own state vector.
+Letters: F forces passed to the compliance controller, S numbers of the task's own
+state vector.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ class Forces:
     force_w: Array  # [F, 3] N, world, on the character; exactly zero: none acts
     point_w: Array  # [F, 3] m, where it acts
     body: Array  # [F] int32, id of the character's body in the scene
-    gate: Array  # [] bool, whether the controller listens
+    gate: Array  # [] bool; False: none of them is passed to the controller
 
 
 @flax.struct.dataclass
@@ -152,7 +153,7 @@ class Task:
         solution: physics.Solution,
         action: Array,
     ) -> tuple[Any, Forces]:
-        """The forces of a substep that the compliance reacts to; may note events."""
+        """The forces of a substep for the compliance controller; may note events."""
         raise NotImplementedError
 
     def observe(self, scene: physics.Scene, state: Any, body: physics.State) -> Array:
@@ -194,11 +195,16 @@ def place_character(scene: physics.Scene, reference: RefState) -> tuple[Array, A
     return qpos, scene.scatter_character(reference.qvel)
 
 
-def resultant(force_w: Array, point_w: Array) -> tuple[Array, Array]:
-    """One force [3] and its point [3] for contacts [C, 3] on one body.
+def resultant(
+    solution: physics.Solution, contacts: physics.Contacts
+) -> tuple[Array, Array]:
+    """The force [3] of contacts on one body, N, and its point [3], m, world.
 
     The point is the centre of pressure: the mean of the points, weighted by |f|.
     """
+    sign = jnp.asarray(contacts.sign)[:, None]
+    force_w = sign * solution.contact_force_w[contacts.slots]
+    point_w = solution.contact_point_w[contacts.slots]
     size = jnp.sqrt(jnp.sum(force_w * force_w, axis=-1) + 1e-12)
     weight = size / jnp.sum(size)
     return force_w.sum(axis=0), jnp.sum(weight[:, None] * point_w, axis=0)

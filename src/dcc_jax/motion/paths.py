@@ -13,7 +13,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from dcc_jax.motion.reference import CONTROL_DT
+from dcc_jax.character import CONTROL_DT
 
 Array = jax.Array
 

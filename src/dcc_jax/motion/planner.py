@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from dcc_jax import quat
-from dcc_jax.character import load_character
+from dcc_jax.character import CONTROL_DT, load_character
 from dcc_jax.motion import paths
 from dcc_jax.motion.paths import Gaits, Motion, direction, path
-from dcc_jax.motion.reference import CONTROL_DT, References, RefState, planar_moved
+from dcc_jax.motion.reference import References, RefState, planar_moved
 
 Array = jax.Array
 
@@ -160,6 +160,8 @@ def go_on(
 ) -> RefState:
     """The reference `elapsed` s later, its root on the path of a motion.
 
+    Its velocity is the path's over the ground, else by central differences.
+
     Args:
         references: of the loops.
         loops: of `strides`.
@@ -169,17 +171,24 @@ def go_on(
     """
     time = at.time + elapsed
     position, heading, speed = path(motion, time)
-    phase = (at.phase + elapsed * loops.cadence(speed)) % 1.0
-    pose = loops.pose(references, phase, speed, time)
     velocity = speed * direction(heading)
+
+    def phase(later: float) -> Array:
+        return (at.phase + (elapsed + later) * loops.cadence(speed)) % 1.0
+
+    def pose(later: float) -> Array:
+        pose = loops.pose(references, phase(later), speed, time + later)
+        return planar_moved(pose, heading + later * motion.turn, position)
+
+    rate = _rate(references.coords, at.qpos, pose(elapsed), 2.0 * elapsed)
     return dataclasses.replace(
         at,
-        qpos=planar_moved(pose, heading, position),
-        qvel=at.qvel.at[:2].set(velocity),
+        qpos=pose(0.0),
+        qvel=rate.at[:2].set(velocity),
         qpos_previous=at.qpos,
         time=time,
         travel=velocity,
-        phase=phase,
+        phase=phase(0.0),
     )
 
 

@@ -17,12 +17,11 @@ import numpy as np
 from flax import struct
 
 from dcc_jax import quat
-from dcc_jax.character import compose_scene, load_character
+from dcc_jax.character import CONTROL_DT, compose_scene, load_character
 from dcc_jax.motion.clip import Clip, seam, velocities
 
 Array = jax.Array
 
-CONTROL_DT = 1.0 / 30.0  # s, the control step of Sec. 5.1
 ROOT_LINEAR = slice(0, 3)  # of qpos and of qvel: world axes
 ROOT_QUAT = slice(3, 7)  # of qpos
 
@@ -53,10 +52,8 @@ class References:
     turn: Array  # [C] rad, heading gained in one period of a loop
     shift: Array  # [C, 2] m, ground covered in one period
     weight: Array  # [C] probability of each clip, sums to one
-    label: Array  # [C] int32, index into `labels`, -1 where a clip has none
     control_dt: float = struct.field(pytree_node=False)  # s
     names: tuple[str, ...] = struct.field(pytree_node=False)
-    labels: tuple[str, ...] = struct.field(pytree_node=False)
     coords: quat.Coordinates = struct.field(pytree_node=False)
 
     @property
@@ -145,10 +142,6 @@ class References:
 
         Three poses one control step apart; none reaches past the end of a clip.
         """
-        return self.sample_labelled_windows(key, count)[0]
-
-    def sample_labelled_windows(self, key: Array, count: int) -> tuple[Array, Array]:
-        """Windows [N, 3, 55] and the label [N] of the clip each comes from."""
         clip_key, time_key = jax.random.split(key)
         clip = self._draw(clip_key, (count,))
         span = self.duration[clip] - jnp.where(
@@ -157,7 +150,7 @@ class References:
         start = jax.random.uniform(time_key, (count,)) * span
         times = start[:, None] + self.control_dt * jnp.arange(3)
         at = jax.vmap(jax.vmap(self.qpos_at, (None, 0)))
-        return at(clip, times), self.label[clip]
+        return at(clip, times)
 
     def _travel(self, clip: Array | int, time: Array) -> Array:
         cycle, _, _ = self._place(clip, time)
@@ -205,7 +198,6 @@ def make_references(
             raise ValueError(
                 f"clip {clip.name!r} lasts {clip.duration:.3f} s, less than {least:.3f}"
             )
-    labels = tuple(sorted({clip.label for clip in clips if clip.label is not None}))
     seams = [seam(clip) if clip.loop else (0.0, np.zeros(2)) for clip in clips]
     longest = max(len(clip.qpos) for clip in clips)
 
@@ -225,13 +217,8 @@ def make_references(
         turn=stacked([turn for turn, _ in seams]),
         shift=stacked([shift for _, shift in seams]),
         weight=stacked(_normalized(weights, len(clips))),
-        label=stacked(
-            [labels.index(c.label) if c.label is not None else -1 for c in clips],
-            np.int32,
-        ),
         control_dt=float(control_dt),
         names=tuple(clip.name for clip in clips),
-        labels=labels,
         coords=_coordinates(),
     )
 

@@ -4,7 +4,7 @@
 `physics.solve(...)`. The contact solver and its sparsity are this package's own.
 """
 
-from dcc_jax.physics.scene import Scene, make_scene
+from dcc_jax.physics.scene import Contacts, Scene, make_scene
 from dcc_jax.physics.step import (
     Kinematics,
     Solution,
@@ -20,6 +20,7 @@ from dcc_jax.physics.step import (
 )
 
 __all__ = [
+    "Contacts",
     "Kinematics",
     "Scene",
     "Solution",

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import jax
@@ -24,6 +25,16 @@ with contextlib.redirect_stdout(io.StringIO()):
     from mujoco import mjx
 
 Array = jax.Array
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """Contact slots of some bodies; `sign * force` acts on the body."""
+
+    slots: np.ndarray  # [K] indices into the scene's C contacts
+    body: np.ndarray  # [K] id of the body that is meant
+    other: np.ndarray  # [K] id of what it touches
+    sign: np.ndarray  # [K] of `Solution.contact_force_w` there
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +70,32 @@ class Scene:
             raise ValueError(f"unknown body {name!r}; the scene has {names}")
         return names.index(name)
 
+    def address(self, joint: str) -> tuple[int, int]:
+        """Where a joint begins in qpos and in qvel.
+
+        Raises:
+            ValueError: no such joint in the scene.
+        """
+        return _address(self.model, joint)
+
+    def contacts(
+        self, bodies: Sequence[int], others: Sequence[int] | None = None
+    ) -> Contacts:
+        """The slots in which one of `bodies` may touch one of `others`, or anything.
+
+        Args:
+            bodies: ids.
+            others: ids; None: every other body.
+        """
+        first, second = self.contact_bodies.T
+        touched = np.isin(second, bodies)
+        other = np.where(touched, first, second)
+        there = touched | np.isin(first, bodies)
+        there &= ~np.isin(other, bodies) if others is None else np.isin(other, others)
+        sign = np.where(touched, 1.0, -1.0)
+        body = np.where(touched, second, first)
+        return Contacts(np.flatnonzero(there), body[there], other[there], sign[there])
+
     def character_qpos(self, qpos: Array) -> Array:
         """The character's slice [..., 55] of qpos [..., nq]."""
         return qpos[..., self.qpos_adr : self.qpos_adr + self.character.nq]
@@ -91,13 +128,13 @@ def make_scene(
     Raises:
         ValueError: no joint `root`, or `newton_iterations` < 1.
     """
-    names = [model.joint(i).name for i in range(model.njnt)]
-    if root not in names:
-        raise ValueError(f"unknown root joint {root!r}; the scene has {names}")
     if newton_iterations < 1:
         raise ValueError(f"newton_iterations must be >= 1, got {newton_iterations}")
     model = copy.copy(model)
-    dof_adr = int(model.joint(root).dofadr[0])
+    qpos_adr, dof_adr = (
+        int(model.joint(root).qposadr[0]),
+        int(model.joint(root).dofadr[0]),
+    )
     spd = np.zeros(model.nv)
     spd[dof_adr : dof_adr + character.nv] = model.opt.timestep * character.kv
     model.dof_armature += spd
@@ -109,7 +146,7 @@ def make_scene(
         model=model,
         character=character,
         coords=Coordinates.of(model),
-        qpos_adr=int(model.joint(root).qposadr[0]),
+        qpos_adr=qpos_adr,
         dof_adr=dof_adr,
         newton_iterations=newton_iterations,
         spd_diagonal=spd,
@@ -119,6 +156,14 @@ def make_scene(
         arrow=arrow(model, _row_pattern(model, contact_bodies)),
         mass_arrow=arrow(model, np.zeros((0, model.nv), bool)),
     )
+
+
+def _address(model: mujoco.MjModel, joint: str) -> tuple[int, int]:
+    names = [model.joint(i).name for i in range(model.njnt)]
+    if joint not in names:
+        raise ValueError(f"unknown joint {joint!r}; the scene has {names}")
+    found = model.joint(joint)
+    return int(found.qposadr[0]), int(found.dofadr[0])
 
 
 def _contact_bodies(

@@ -18,8 +18,9 @@ import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
 from dcc_jax.env.config import CONTROL_RATE
-from dcc_jax.env.environment import ALPHA_ENTRY, Environment
+from dcc_jax.env.environment import Environment
 from dcc_jax.env.mechanics import Mechanics
+from dcc_jax.env.observation import ALPHA_ENTRY
 from dcc_jax.env.state import EnvState
 from dcc_jax.learn.rollout import Policy
 from dcc_jax.play import recording

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import mujoco
 
 from dcc_jax import physics, quat
+from dcc_jax.character import CONTROL_DT, CONTROL_RATE
 from dcc_jax.env import features
 from dcc_jax.env.task import Forces, Task, place_character
 from dcc_jax.motion.reference import RefState
@@ -142,8 +143,8 @@ class Ball(Task):
         qpos, qvel = place_character(scene, reference)
         lean = jax.random.uniform(lean_key, (2,), minval=-self.tilt, maxval=self.tilt)
         crown = _on_head(reference.qpos, CROWN)
-        velocity = 30.0 * (crown - _on_head(reference.qpos_previous, CROWN))
-        q_adr, v_adr = _pole(scene)
+        velocity = CONTROL_RATE * (crown - _on_head(reference.qpos_previous, CROWN))
+        q_adr, v_adr = scene.address("pole")
         pose = jnp.concatenate([crown, quat.exp(jnp.append(lean, 0.0))])
         state = BallState(self.interval * jax.random.uniform(push_key))
         return (
@@ -160,7 +161,7 @@ class Ball(Task):
         pushed = self._pushed(key, scene, body)
         body = dataclasses.replace(body, qvel=jnp.where(due, pushed, body.qvel))
         waited = jnp.where(due, self.interval, state.next_push)
-        return BallState(waited - 1.0 / 30.0), body
+        return BallState(waited - CONTROL_DT), body
 
     def _pushed(self, key: Array, scene: physics.Scene, body: physics.State) -> Array:
         """Velocities [nv] after an impulse on the ball; the pivot stays as it moves."""
@@ -168,7 +169,7 @@ class Ball(Task):
         side = jax.random.uniform(side_key, minval=-jnp.pi, maxval=jnp.pi)
         speed = jax.random.uniform(speed_key, minval=self.push[0], maxval=self.push[1])
         change_w = speed * jnp.stack([jnp.cos(side), jnp.sin(side), jnp.zeros(())])
-        q_adr, v_adr = _pole(scene)
+        q_adr, v_adr = scene.address("pole")
         change = quat.rotate(quat.inv(body.qpos[q_adr + 3 : q_adr + 7]), change_w)
         # omega x r = change, for r along the pole's own z axis.
         turn = jnp.stack([-change[1], change[0], jnp.zeros(())]) / self.pole_length
@@ -234,11 +235,6 @@ class Ball(Task):
         return (ball - head)[:2]
 
 
-def _pole(scene: physics.Scene) -> tuple[int, int]:
-    joint = scene.model.joint("pole")
-    return int(joint.qposadr[0]), int(joint.dofadr[0])
-
-
 def _on_head(q: Array, offset: tuple[float, float, float]) -> Array:
     """World position [3] of a point of the head at the character's coordinates [55]."""
     pos_w, quat_w = features.body_pose(q, "head")
@@ -249,7 +245,7 @@ def _along_pole(
     scene: physics.Scene, body: physics.State, height: float
 ) -> tuple[Array, Array]:
     """World position [3] and velocity [3] of the point at a height of the pole."""
-    q_adr, v_adr = _pole(scene)
+    q_adr, v_adr = scene.address("pole")
     foot, turn = body.qpos[q_adr : q_adr + 3], body.qpos[q_adr + 3 : q_adr + 7]
     linear, angular = body.qvel[v_adr : v_adr + 3], body.qvel[v_adr + 3 : v_adr + 6]
     point = jnp.array([0.0, 0.0, height])
@@ -259,6 +255,6 @@ def _along_pole(
 
 def _upright(scene: physics.Scene, body: physics.State) -> Array:
     """Cosine of the pole's angle from the vertical."""
-    q_adr, _ = _pole(scene)
+    q_adr, _ = scene.address("pole")
     up = jnp.array([0.0, 0.0, 1.0])
     return quat.rotate(body.qpos[q_adr + 3 : q_adr + 7], up)[2]

@@ -26,12 +26,12 @@ import mujoco
 import numpy as np
 
 from dcc_jax import physics, quat
-from dcc_jax.character import add_contact
+from dcc_jax.character import CONTROL_DT, add_contact
 from dcc_jax.env import features
 from dcc_jax.env.task import Forces, Task, place_character, resultant
 from dcc_jax.motion import paths
 from dcc_jax.motion.paths import Gaits, Motion
-from dcc_jax.motion.reference import CONTROL_DT, References, RefState, planar_moved
+from dcc_jax.motion.reference import References, RefState, planar_moved
 
 Array = jax.Array
 
@@ -156,7 +156,7 @@ class ChickenFight(Task):
             force_peak=jnp.zeros(()),
         )
         qpos, qvel = place_character(scene, reference)
-        adr, _ = _address(scene, self.opponent)
+        adr, _ = scene.address(self.opponent)
         far = root + 2.0 * self.distance * paths.direction(way)
         return state, qpos.at[adr : adr + 2].set(far), qvel
 
@@ -198,7 +198,7 @@ class ChickenFight(Task):
         across = jnp.stack([-away[1], away[0]])
         root = scene.character_qpos(body.qpos)[:2]
         place = jnp.append(root + self.distance * away + aim * across, side)
-        adr, dof = _address(scene, self.opponent)
+        adr, dof = scene.address(self.opponent)
         return dataclasses.replace(
             body,
             qpos=body.qpos.at[adr : adr + 3].set(place),
@@ -212,7 +212,7 @@ class ChickenFight(Task):
         """The box brakes a while after it has bumped, so that it does not lean on."""
         lets_go = ~state.coming & (state.since_bump > self.let_go)
         slower = jnp.where(lets_go, math.exp(-CONTROL_DT / self.brake_time), 1.0)
-        _, dof = _address(scene, self.opponent)
+        _, dof = scene.address(self.opponent)
         qvel = body.qvel.at[dof : dof + 3].multiply(slower)
         return dataclasses.replace(body, qvel=qvel)
 
@@ -250,16 +250,14 @@ class ChickenFight(Task):
         self, scene: physics.Scene, solution: physics.Solution, body: int
     ) -> tuple[Array, Array]:
         """The opponent's force [3] on a body, and its point [3]."""
-        slots, sign = opponent_contacts(scene, body, self.opponent)
-        force = jnp.asarray(sign)[:, None] * solution.contact_force_w[slots]
-        return resultant(force, solution.contact_point_w[slots])
+        return resultant(solution, opponent_contacts(scene, body, self.opponent))
 
     def observe(
         self, scene: physics.Scene, state: ChickenFightState, body: physics.State
     ) -> Array:
         """Where the opponent is and how it moves [4], relative to the character."""
         q, qd = scene.character_qpos(body.qpos), scene.character_qvel(body.qvel)
-        adr, dof = _address(scene, self.opponent)
+        adr, dof = scene.address(self.opponent)
         offset = body.qpos[adr : adr + 2] - q[:2]
         velocity = body.qvel[dof : dof + 2] - qd[:2]
         _, facing = features.local_frame(q)
@@ -274,7 +272,7 @@ class ChickenFight(Task):
         the bump began (s)."""
         q = scene.character_qpos(body.qpos)
         root, _, _ = paths.path(state.motion, state.motion.time + CONTROL_DT)
-        adr, _ = _address(scene, self.opponent)
+        adr, _ = scene.address(self.opponent)
         return {
             "bump_impulse": _length(state.impulse),
             "bump_force_peak": state.force_peak,
@@ -286,21 +284,11 @@ class ChickenFight(Task):
 
 def opponent_contacts(
     scene: physics.Scene, body: int, opponent: str
-) -> tuple[np.ndarray, np.ndarray]:
-    """Contact slots of a body with the opponent, and the force's sign on the body."""
+) -> physics.Contacts:
+    """Where a body touches the opponent, whose free joint is `opponent`."""
     model = scene.model
     rival = model.body_rootid[model.jnt_bodyid[model.joint(opponent).id]]
-    first, second = scene.contact_bodies.T
-    first_hit = (first == body) & (model.body_rootid[second] == rival)
-    second_hit = (second == body) & (model.body_rootid[first] == rival)
-    slots = np.flatnonzero(first_hit | second_hit)
-    return slots, np.where(second_hit[slots], 1.0, -1.0)
-
-
-def _address(scene: physics.Scene, joint: str) -> tuple[int, int]:
-    """Where a joint begins in qpos and in qvel."""
-    found = scene.model.joint(joint)
-    return int(found.qposadr[0]), int(found.dofadr[0])
+    return scene.contacts([body], np.flatnonzero(model.body_rootid == rival).tolist())
 
 
 def _length(vector: Array) -> Array:

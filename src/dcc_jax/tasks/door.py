@@ -23,6 +23,7 @@ import mujoco
 import numpy as np
 
 from dcc_jax import physics, quat
+from dcc_jax.character import CONTROL_DT, CONTROL_RATE
 from dcc_jax.env import features
 from dcc_jax.env.task import Forces, Task, place_character
 from dcc_jax.motion.reference import RefState
@@ -141,7 +142,7 @@ class Door(Task):
         """The door as wide open as the moment of the clip has it, hand on knob."""
         qpos, qvel = place_character(scene, reference)
         angle, rate = self._angle_at(reference)
-        q_adr, v_adr = _hinge(scene)
+        q_adr, v_adr = scene.address("hinge")
         time = reference.time
         state = DoorState(
             time=time,
@@ -159,7 +160,8 @@ class Door(Task):
         time = reference.time
         held = (time >= GRASP_TIME) & (time < RELEASE_TIME)
         after = jnp.where(time < GRASP_TIME, 0.0, OPENING)
-        return jnp.where(held, now, after), jnp.where(held, 30.0 * (now - before), 0.0)
+        rate = CONTROL_RATE * (now - before)
+        return jnp.where(held, now, after), jnp.where(held, rate, 0.0)
 
     def _bearing(self, point_w: Array) -> Array:
         """Angle of the door that points at a point [3], rad."""
@@ -172,7 +174,7 @@ class Door(Task):
         """The clip goes on; the forces are noted anew."""
         zero = jnp.zeros(())
         state = dataclasses.replace(
-            state, time=state.time + 1.0 / 30.0, orthogonal=zero, parallel=zero
+            state, time=state.time + CONTROL_DT, orthogonal=zero, parallel=zero
         )
         return state, body
 
@@ -199,7 +201,7 @@ class Door(Task):
         force = solution.equality_force[:3]
         along = force @ path
         orthogonal = force - along * path
-        share = 30.0 * scene.timestep
+        share = CONTROL_RATE * scene.timestep
         near = jnp.sum(jnp.square(palm - knob)) < self.reach**2
         due = (state.time >= GRASP_TIME) & (state.time < RELEASE_TIME)
         noted = dataclasses.replace(
@@ -220,7 +222,7 @@ class Door(Task):
     ) -> Array:
         """Angle, grip, knob in the hand's frame [3], the way through the door [2]."""
         q = scene.character_qpos(body.qpos)
-        angle = body.qpos[_hinge(scene)[0]]
+        angle = body.qpos[scene.address("hinge")[0]]
         circle = self.width * jnp.stack([jnp.sin(angle), jnp.cos(angle)])
         knob = jnp.append(jnp.asarray(self.hinge) + circle, KNOB[2])
         hand_w, turn_w = features.body_pose(q, HAND)
@@ -239,14 +241,14 @@ class Door(Task):
         self, scene: physics.Scene, state: DoorState, body: physics.State
     ) -> Array:
         """r_task = exp(-1.5 max(0, 0.7 - angle))."""
-        angle = body.qpos[_hinge(scene)[0]]
+        angle = body.qpos[scene.address("hinge")[0]]
         return jnp.exp(-1.5 * jnp.maximum(0.0, TARGET_ANGLE - angle))
 
     def evaluate(
         self, scene: physics.Scene, state: DoorState, body: physics.State
     ) -> dict[str, Array]:
         """Angle in rad, whether that is open; while the hand holds, the forces in N."""
-        angle = body.qpos[_hinge(scene)[0]]
+        angle = body.qpos[scene.address("hinge")[0]]
         return {
             "angle": angle,
             "open": angle >= TARGET_ANGLE,
@@ -254,11 +256,6 @@ class Door(Task):
             "orthogonal_force": jnp.where(state.holding, state.orthogonal, jnp.nan),
             "parallel_force": jnp.where(state.holding, state.parallel, jnp.nan),
         }
-
-
-def _hinge(scene: physics.Scene) -> tuple[int, int]:
-    joint = scene.model.joint("hinge")
-    return int(joint.qposadr[0]), int(joint.dofadr[0])
 
 
 def _palm(q: Array) -> Array:

@@ -25,12 +25,12 @@ import mujoco
 import numpy as np
 
 from dcc_jax import physics, quat
-from dcc_jax.character import BODIES, compose_scene, load_character
+from dcc_jax.character import BODIES, CONTROL_DT, compose_scene, load_character
 from dcc_jax.env import features
 from dcc_jax.env.task import Forces, Task, place_character
 from dcc_jax.motion import paths, planner
 from dcc_jax.motion.paths import Gaits, Motion
-from dcc_jax.motion.reference import CONTROL_DT, References, RefState
+from dcc_jax.motion.reference import References, RefState
 
 Array = jax.Array
 

@@ -18,11 +18,18 @@ import jax.numpy as jnp
 import mujoco
 
 from dcc_jax import physics, quat
-from dcc_jax.character import Character, add_contact, compose_scene, sole_names
+from dcc_jax.character import (
+    CONTROL_DT,
+    Character,
+    add_contact,
+    compose_scene,
+    sole_names,
+)
 from dcc_jax.env.environment import Environment
-from dcc_jax.env.state import ControlInputs, EnvState, Substep
+from dcc_jax.env.state import EnvState, Substep
+from dcc_jax.env.substep import physics_step
 from dcc_jax.motion import paths
-from dcc_jax.motion.reference import CONTROL_DT, References, RefState, planar_moved
+from dcc_jax.motion.reference import References, RefState, planar_moved
 from dcc_jax.tasks.chicken_fight import (
     FRICTION,
     TARGETS,
@@ -57,7 +64,7 @@ class Fighter(ChickenFight):
     ) -> ChickenFightState:
         """The reference ahead of the root, on its way to the opponent."""
         root = scene.character_qpos(body.qpos)[:2]
-        adr = int(scene.model.joint(self.opponent).qposadr[0])
+        adr, _ = scene.address(self.opponent)
         way = body.qpos[adr : adr + 2] - root
         heading = jnp.arctan2(way[1], way[0])
         motion = dataclasses.replace(
@@ -161,33 +168,19 @@ class Match:
             side.begin(keys[i], states[i], actions[i])
             for i, side in enumerate(self.sides)
         ]
-        plans = [plan for _, plan in begun]
-        ends, _ = jax.lax.scan(
-            lambda carry, _: (self._substep(carry, plans), None),
-            [start for start, _ in begun],
-            None,
-            length=self.control_steps,
-        )
+        inputs = [inputs for _, inputs in begun]
+        sides = [side.side for side in self.sides]
+
+        def one(carries: list[Substep], _: None) -> tuple[list[Substep], None]:
+            steps = physics_step(sides, carries, inputs)
+            return [carry for carry, _ in steps], None
+
+        starts = [start for start, _ in begun]
+        ends, _ = jax.lax.scan(one, starts, None, length=self.control_steps)
         first, second = (
-            side.end(states[i], plans[i], ends[i]) for i, side in enumerate(self.sides)
+            side.end(states[i], inputs[i], ends[i]) for i, side in enumerate(self.sides)
         )
         return first, second
-
-    def _substep(
-        self, carry: list[Substep], plans: list[ControlInputs]
-    ) -> list[Substep]:
-        body = carry[0].body
-        kin = physics.kinematics(self.scene, body)
-        both = list(zip(self.sides, carry, plans, strict=True))
-        torques = [side.torque(own, plan) for side, own, plan in both]
-        qfrc = jnp.zeros(self.scene.model.nv)
-        for side, tau in zip(self.sides, torques, strict=True):
-            qfrc = qfrc + side.scene.scatter_character(tau)
-        solution = physics.solve(self.scene, kin, body, qfrc)
-        return [
-            side.react(own, plan, kin, tau, solution)[0]
-            for (side, own, plan), tau in zip(both, torques, strict=True)
-        ]
 
     def _sharing(self, states: list[EnvState]) -> Sides:
         """The two states with one body, each aware of the other."""

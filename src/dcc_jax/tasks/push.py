@@ -19,7 +19,7 @@ import mujoco
 import numpy as np
 
 from dcc_jax import physics
-from dcc_jax.character import add_contact
+from dcc_jax.character import CONTROL_DT, GRAVITY, add_contact
 from dcc_jax.env.task import Forces, Task, place_character
 from dcc_jax.motion.reference import RefState
 
@@ -28,7 +28,6 @@ Array = jax.Array
 TARGETS = ("chest", "abdomen", "pelvis", "head", "left_upper_arm", "right_upper_arm")
 """Geoms a ball can hit."""
 AIM_HEIGHTS = (0.75, 1.35)  # m above the ground, of the standing character
-GRAVITY = 9.81
 AWAY = (0.0, 0.0, -10.0)  # m, from where the ball slides, out of sight
 
 
@@ -96,7 +95,7 @@ class Push(Task):
         thrown = self._thrown(key, scene, body)
         body = jax.tree.map(lambda a, b: jnp.where(due, a, b), thrown, body)
         waited = jnp.where(due, self.interval, state.next_throw)
-        return PushState(waited - 1.0 / 30.0), body
+        return PushState(waited - CONTROL_DT), body
 
     def _thrown(
         self, key: Array, scene: physics.Scene, body: physics.State
@@ -114,7 +113,7 @@ class Push(Task):
         start = jnp.append(root, height) + self.distance * away
         # It rises by as much as gravity takes until it arrives.
         velocity = -speed * away + jnp.append(drift, 0.5 * GRAVITY * flight)
-        q_adr, v_adr = _ball(scene)
+        q_adr, v_adr = scene.address("ball")
         return dataclasses.replace(
             body,
             qpos=body.qpos.at[q_adr : q_adr + 3].set(start - jnp.array(AWAY)),
@@ -131,13 +130,13 @@ class Push(Task):
         action: Array,
     ) -> tuple[PushState, Forces]:
         """The strongest contact of the ball, F = 1."""
-        slots, bodies, sign = _ball_contacts(scene)
-        force = sign[:, None] * solution.contact_force_w[slots]
+        hit = scene.contacts([scene.body("ball")])
+        force = -hit.sign[:, None] * solution.contact_force_w[hit.slots]
         strongest = jnp.argmax(jnp.sum(force * force, axis=-1))
         return state, Forces(
             force_w=force[strongest][None],
-            point_w=solution.contact_point_w[slots][strongest][None],
-            body=jnp.asarray(bodies)[strongest][None],
+            point_w=solution.contact_point_w[hit.slots][strongest][None],
+            body=jnp.asarray(hit.other)[strongest][None],
             gate=jnp.ones((), bool),
         )
 
@@ -159,21 +158,3 @@ class Push(Task):
 
 def _drift(scene: physics.Scene, body: physics.State) -> Array:
     return scene.character_qvel(body.qvel)[:2]
-
-
-def _ball(scene: physics.Scene) -> tuple[int, int]:
-    joint = scene.model.joint("ball")
-    return int(joint.qposadr[0]), int(joint.dofadr[0])
-
-
-def _ball_contacts(scene: physics.Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Contact slots of the ball, the character's bodies there, and the force's sign."""
-    ball = scene.body("ball")
-    bodies = scene.contact_bodies
-    slots = np.flatnonzero((bodies == ball).any(axis=1))
-    second = bodies[slots, 1] != ball
-    return (
-        slots,
-        np.where(second, bodies[slots, 1], bodies[slots, 0]),
-        np.where(second, 1.0, -1.0),
-    )

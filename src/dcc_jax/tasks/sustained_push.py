@@ -22,11 +22,12 @@ import jax
 import jax.numpy as jnp
 
 from dcc_jax import physics, quat
+from dcc_jax.character import CONTROL_DT
 from dcc_jax.env import features
 from dcc_jax.env.task import Forces, Task, place_character
 from dcc_jax.motion import paths, planner
 from dcc_jax.motion.paths import Gaits, Motion
-from dcc_jax.motion.reference import CONTROL_DT, References, RefState
+from dcc_jax.motion.reference import References, RefState
 
 Array = jax.Array
 

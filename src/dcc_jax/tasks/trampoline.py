@@ -20,13 +20,12 @@ import mujoco
 import numpy as np
 
 from dcc_jax import physics
-from dcc_jax.character import FEET, add_contact, sole_names
+from dcc_jax.character import CONTROL_DT, FEET, GRAVITY, add_contact, sole_names
 from dcc_jax.env.task import Forces, Task, place_character, resultant
-from dcc_jax.motion.reference import CONTROL_DT, RefState
+from dcc_jax.motion.reference import RefState
 
 Array = jax.Array
 
-GRAVITY = 9.81
 PITCH = 4  # of the character's qvel: the pelvis turns forward about its left
 FLIP = 1.5 * np.pi  # rad
 HALF_SIZE, HALF_THICKNESS = 1.5, 0.05  # m
@@ -145,7 +144,7 @@ class Trampoline(Task):
         """The weights that the springs' rest position carries, and the kick."""
         weight = GRAVITY * float(scene.model.body_mass.sum())
         kicking = state.next_bounce <= 0.0
-        height = int(scene.model.joint("plate_z").dofadr[0])
+        _, height = scene.address("plate_z")
         force = weight + jnp.where(kicking, self.kick, 0.0)
         return jnp.zeros(scene.model.nv).at[height].set(force)
 
@@ -159,7 +158,7 @@ class Trampoline(Task):
     ) -> tuple[TrampolineState, Forces]:
         """One resultant a foot, F = 2; heard for a while after each landing."""
         feet = [scene.body(name) for name in FEET]
-        sums = [_foot_force(scene, solution, foot) for foot in feet]
+        sums = [resultant(solution, scene.contacts([foot])) for foot in feet]
         force = jnp.stack([f for f, _ in sums])
         touching = jnp.any(force != 0.0)
         landing = touching & (state.airborne > self.flight_time)
@@ -179,8 +178,7 @@ class Trampoline(Task):
         self, scene: physics.Scene, state: TrampolineState, body: physics.State
     ) -> Array:
         """Plate height, tilt and their rates [6]; time to and since events [2]."""
-        adr = int(scene.model.joint("plate_z").qposadr[0])
-        dof = int(scene.model.joint("plate_z").dofadr[0])
+        adr, dof = scene.address("plate_z")
         return jnp.concatenate(
             [
                 body.qpos[adr : adr + 3],
@@ -200,7 +198,7 @@ class Trampoline(Task):
         self, scene: physics.Scene, state: TrampolineState, body: physics.State
     ) -> Array:
         """Height of the plate's middle."""
-        return body.qpos[int(scene.model.joint("plate_z").qposadr[0])]
+        return body.qpos[scene.address("plate_z")[0]]
 
     def evaluate(
         self, scene: physics.Scene, state: TrampolineState, body: physics.State
@@ -215,13 +213,3 @@ class Trampoline(Task):
             "turned": state.turned,
             "flips": state.flips,
         }
-
-
-def _foot_force(
-    scene: physics.Scene, solution: physics.Solution, foot: int
-) -> tuple[Array, Array]:
-    bodies = scene.contact_bodies
-    slots = np.flatnonzero((bodies == foot).any(axis=1))
-    sign = np.where(bodies[slots, 1] == foot, 1.0, -1.0)
-    force = jnp.asarray(sign)[:, None] * solution.contact_force_w[slots]
-    return resultant(force, solution.contact_point_w[slots])

@@ -1,0 +1,75 @@
+"""What the policy observes (Sec. 4.2), and where things are in it.
+
+One vector: the 306 numbers of the state, the way to the reference's root and its
+velocity over the ground, alpha, the reference's phase where it is followed in time, and
+the task's own numbers. Everything is written for ONE environment.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from dcc_jax import physics, quat
+from dcc_jax.env import features
+from dcc_jax.env.features import FEATURE_SIZE, STATE_SIZE, Kinematics
+from dcc_jax.env.state import EnvState
+from dcc_jax.env.task import RootTarget, Task
+from dcc_jax.motion.reference import RefState
+
+Array = jax.Array
+
+ALPHA_ENTRY = STATE_SIZE + 4
+"""Where alpha is: behind the way to the root and its velocity, two numbers each."""
+PHASE_SIZE = 3  # where the reference is followed in time
+
+
+def size(task: Task) -> int:
+    """How many numbers a policy of the task observes."""
+    phase = PHASE_SIZE if task.tracks_reference else 0
+    return ALPHA_ENTRY + 1 + phase + task.state_size
+
+
+def observation(
+    task: Task,
+    scene: physics.Scene,
+    kinematics: Kinematics,
+    state: EnvState,
+    target: RootTarget,
+) -> tuple[Array, Array]:
+    """The observation [O] of a state, and its features [270].
+
+    Args:
+        task: of the environment.
+        scene: likewise.
+        kinematics: of the character.
+        state: now.
+        target: the reference's root now.
+    """
+    q = scene.character_qpos(state.body.qpos)
+    numbers = features.state(
+        kinematics, q, state.q_previous, state.displacement.u, state.u_previous
+    )
+    offset = target.position + state.displacement.u[:2] - q[:2]
+    parts = [
+        numbers,
+        _seen_from(q, offset),
+        _seen_from(q, target.velocity),
+        state.alpha[None],
+        _phase(state.reference) if task.tracks_reference else jnp.zeros(0),
+        task.observe(scene, state.task, state.body),
+    ]
+    return jnp.concatenate(parts), numbers[:FEATURE_SIZE]
+
+
+def _phase(reference: RefState) -> Array:
+    """The reference's phase [3]: as it is, and as a point of the circle, where a
+    stride's end is its beginning."""
+    turn = 2.0 * jnp.pi * reference.phase
+    return jnp.stack([reference.phase, jnp.cos(turn), jnp.sin(turn)])
+
+
+def _seen_from(q: Array, vector: Array) -> Array:
+    """A vector [2] on the ground in the local frame of the character's q [55]."""
+    _, heading = features.local_frame(q)
+    return quat.rotate(quat.inv(heading), jnp.append(vector, 0.0))[:2]

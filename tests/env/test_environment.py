@@ -1,0 +1,160 @@
+"""The heart: one control step, how it is judged, and what keeps a run going."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dcc_jax import quat
+from dcc_jax.character import CONTROL_DT, Character, asset_path
+from dcc_jax.control import pd
+from dcc_jax.env.config import EnvConfig
+from dcc_jax.env.environment import Environment
+from dcc_jax.env.observation import ALPHA_ENTRY
+from dcc_jax.env.state import EnvState
+from dcc_jax.motion.clip import load_clip
+from dcc_jax.motion.reference import make_references
+from dcc_jax.tasks.push import Push
+
+CONFIG = EnvConfig(alpha=0.1, alpha_max=0.5, episode_seconds=2.0)
+SEED = 3
+
+
+def make(character: Character, config: EnvConfig) -> Environment:
+    clip = load_clip(asset_path("motions/stand.npz"))
+    return Environment(Push(), character, make_references([clip]), config)
+
+
+@pytest.fixture(scope="module")
+def environment(character: Character) -> Environment:
+    return make(character, CONFIG)
+
+
+@pytest.fixture(scope="module")
+def start(environment: Environment) -> EnvState:
+    return jax.jit(environment.reset)(jax.random.key(0))
+
+
+@pytest.fixture(scope="module")
+def step(environment: Environment):
+    """(state) -> the state after a control step of the zero action."""
+    action = jnp.zeros(environment.action_size)
+    return jax.jit(lambda state: environment.step(jax.random.key(SEED), state, action))
+
+
+def moved(state: EnvState, **entries: float) -> EnvState:
+    """The state with entries of qpos changed: x, y, z of the root."""
+    qpos = state.body.qpos
+    for name, value in entries.items():
+        qpos = qpos.at["xyz".index(name)].set(value)
+    return dataclasses.replace(state, body=dataclasses.replace(state.body, qpos=qpos))
+
+
+def test_a_standing_character_goes_on(start, step):
+    after = step(start)
+    assert not after.terminated and not after.truncated and not after.nan
+    np.testing.assert_allclose(after.time, CONTROL_DT, rtol=1e-5)
+    np.testing.assert_array_equal(after.previous_features, start.features)
+
+
+def test_a_pelvis_near_the_ground_has_fallen(environment, start, step):
+    low = environment.fallen.pelvis - 0.05
+    assert step(moved(start, z=low)).terminated
+
+
+def test_a_hand_on_the_ground_is_a_fall_though_the_pelvis_is_high(environment):
+    coords = environment.kinematics.coords
+    bend = jnp.zeros(Character.nv).at[7].set(2.6)  # the spine, forward
+    upright = jnp.asarray(environment.scene.model.qpos0[:55], jnp.float32)
+    bent = quat.oplus(coords, upright, quat.exp_map(coords, bend)).at[2].set(0.7)
+    ground = jnp.zeros(())
+    assert not environment.fallen(environment.kinematics, upright, ground)
+    assert environment.fallen(environment.kinematics, bent, ground)
+    # It is the height above the ground that counts.
+    assert not environment.fallen(environment.kinematics, bent, ground - 1.0)
+
+
+def test_the_time_runs_out(start, step):
+    late = dataclasses.replace(start, time=jnp.array(2.0 - 1.5 * CONTROL_DT))
+    assert not step(late).truncated
+    assert step(dataclasses.replace(late, time=late.time + CONTROL_DT)).truncated
+
+
+def test_a_number_that_is_not_finite_ends_the_episode_and_goes_no_further(start, step):
+    qvel = start.body.qvel.at[10].set(jnp.nan)
+    broken = dataclasses.replace(start, body=dataclasses.replace(start.body, qvel=qvel))
+    after = step(broken)
+    assert after.nan and after.terminated and not after.truncated
+    # The state before the step is kept, the number that was broken already with it.
+    np.testing.assert_array_equal(after.body.qpos, start.body.qpos)
+    assert np.isfinite(after.obs).all() and np.isfinite(after.features).all()
+
+
+@pytest.mark.parametrize(("x", "u"), [(0.0, 0.0), (0.3, 0.0), (0.3, 0.3)])
+def test_r_p_is_of_the_root_against_its_target_and_u(environment, start, step, x, u):
+    """Eq. 14 with its weights written out: a displaced root may be where u says."""
+    displacement = dataclasses.replace(
+        start.displacement, u=start.displacement.u.at[0].set(u)
+    )
+    state = dataclasses.replace(
+        moved(start, x=float(start.start.position[0]) + x), displacement=displacement
+    )
+    after = step(state)
+    q = np.asarray(after.body.qpos[:2]) - np.asarray(start.start.position)
+    p = q - np.asarray(after.displacement.u[:2])
+    v = np.asarray(after.body.qvel[:2]) - np.asarray(after.displacement.ud[:2])
+    expected = 0.7 * np.exp(-0.5 * p @ p) + 0.3 * np.exp(-1.0 * v @ v)
+    np.testing.assert_allclose(after.r_p, expected, rtol=1e-4)
+    if x != u:
+        assert after.r_p < 1.0 - 0.02
+
+
+@pytest.mark.parametrize("displaced", [True, False])
+def test_the_pd_target_is_displaced_unless_it_is_switched_off(
+    environment, start, displaced
+):
+    coords = environment.kinematics.coords
+    environment = _like(environment, displace_target=displaced)
+    turn = jnp.zeros(Character.nv).at[20].set(0.4)
+    state = dataclasses.replace(
+        start,
+        displacement=dataclasses.replace(
+            start.displacement, u=quat.exp_map(coords, turn)
+        ),
+    )
+    carry, inputs = environment.begin(
+        jax.random.key(SEED), state, jnp.zeros(environment.action_size)
+    )
+    scene = environment.scene
+    q, qd = (
+        scene.character_qpos(state.body.qpos),
+        scene.character_qvel(state.body.qvel),
+    )
+    wanted = inputs.pose
+    if displaced:
+        wanted = quat.oplus(coords, wanted, state.displacement.u)
+    expected = pd.torque(scene.character, q, qd, wanted, scene.timestep)
+    tau = environment.side.torque(carry, inputs)
+    np.testing.assert_allclose(tau, expected, rtol=1e-5)
+    other = pd.torque(scene.character, q, qd, inputs.pose, scene.timestep)
+    assert np.allclose(tau, other) != displaced, "u must be large enough to be seen"
+
+
+def _like(environment: Environment, **changes) -> Environment:
+    twin = copy.copy(environment)
+    twin.config = dataclasses.replace(environment.config, **changes)
+    return twin
+
+
+def test_alpha_is_drawn_from_its_range_and_observed(environment):
+    states = jax.jit(jax.vmap(environment.reset))(
+        jax.random.split(jax.random.key(SEED), 64)
+    )
+    alpha = np.asarray(states.alpha)
+    assert alpha.min() >= 0.1 and alpha.max() <= 0.5 and np.ptp(alpha) > 0.3
+    np.testing.assert_array_equal(states.obs[:, ALPHA_ENTRY], alpha)
