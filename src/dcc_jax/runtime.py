@@ -32,7 +32,8 @@ def setup(*, devices: int | None = None, cache_dir: str | None = None) -> None:
         devices: host devices on a CPU; default one per core this process may use, or
             what `DCC_JAX_DEVICES` says.
         cache_dir: of compiled programs; default `DCC_JAX_CACHE`, else
-            `~/.cache/dcc_jax`. An empty string switches the cache off.
+            `~/.cache/dcc_jax`. An empty string switches the cache off; where nothing
+            can be written it is off with a word.
 
     Raises:
         RuntimeError: jax is imported already.
@@ -46,15 +47,32 @@ def setup(*, devices: int | None = None, cache_dir: str | None = None) -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     import jax
 
-    if cache_dir is None:
-        cache_dir = os.environ.get(
-            "DCC_JAX_CACHE", str(Path.home() / ".cache" / "dcc_jax")
-        )
-    if cache_dir:
+    if cache_dir := _usable_cache(cache_dir):
         jax.config.update("jax_compilation_cache_dir", cache_dir)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
     jax.config.update("jax_default_matmul_precision", "highest")
     check_versions(jax.default_backend())
+
+
+def _usable_cache(wanted: str | None) -> str:
+    """The folder of compiled programs, made; "" where there cannot be one."""
+    chosen = os.environ.get("DCC_JAX_CACHE") if wanted is None else wanted
+    if chosen == "":
+        return ""
+    try:
+        # Path.home() fails for a user without a home, as in many containers.
+        folder = Path(chosen) if chosen else Path.home() / ".cache" / "dcc_jax"
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            raise PermissionError(f"{folder} is not writable")
+    except (OSError, RuntimeError) as error:
+        print(
+            f"dcc_jax: compiled programs are not kept, so every start compiles anew "
+            f"({error}); DCC_JAX_CACHE=DIR keeps them",
+            file=sys.stderr,
+        )
+        return ""
+    return str(folder)
 
 
 def _set_host_devices(devices: int | None) -> None:
