@@ -203,7 +203,7 @@ def test_wrong_shapes_are_refused(model):
 
 def test_machine_without_display_is_asked_once():
     """MuJoCo aborts the process when it fails to draw a second time."""
-    code = "from dcc_jax import draw; draw.opengl_works(); draw.opengl_works()"
+    code = "from dcc_jax.viz import draw; draw.opengl_works(); draw.opengl_works()"
     environment = {k: v for k, v in os.environ.items() if k != "DISPLAY"}
     done = subprocess.run(
         [sys.executable, "-c", code],
@@ -222,7 +222,7 @@ def test_drawing_leaves_the_environment_to_the_caller_and_its_children(libraries
     """A child that inherits a MUJOCO_GL without its library cannot import mujoco."""
     code = """
 import os, subprocess, sys
-from dcc_jax import draw
+from dcc_jax.viz import draw
 if sys.argv[1] == "none":
     draw.find_library = lambda name: None
 before = dict(os.environ)

@@ -1,4 +1,4 @@
-"""The process: where compiled programs are kept."""
+"""The process: where compiled programs are kept, and which OpenGL was asked for."""
 
 import os
 import subprocess
@@ -68,3 +68,15 @@ def test_a_cache_that_is_read_only_is_not_used(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(runtime.os, "access", lambda *_: False)
     assert runtime._usable_cache(str(tmp_path)) == ""
     assert f"{tmp_path} is not writable" in capsys.readouterr().err
+
+
+def test_an_opengl_that_mujoco_cannot_load_is_one_line_and_status_two():
+    done = subprocess.run(
+        [sys.executable, "-m", "dcc_jax.render", "push"],
+        env={**os.environ, "MUJOCO_GL": "nonsense"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1 and "MUJOCO_GL=nonsense" in done.stderr

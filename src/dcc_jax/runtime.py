@@ -6,6 +6,7 @@ does not: importing dcc_jax changes nothing in the caller's process.
 
 from __future__ import annotations
 
+import importlib
 import importlib.metadata
 import os
 import sys
@@ -37,7 +38,7 @@ def setup(*, devices: int | None = None, cache_dir: str | None = None) -> None:
 
     Raises:
         RuntimeError: jax is imported already.
-        ValueError: `devices` is not positive.
+        ValueError: `devices` is not positive; MUJOCO_GL names what is not there.
         SystemExit: this version of jax hangs on this backend.
     """
     if "jax" in sys.modules:
@@ -52,6 +53,7 @@ def setup(*, devices: int | None = None, cache_dir: str | None = None) -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
     jax.config.update("jax_default_matmul_precision", "highest")
     check_versions(jax.default_backend())
+    check_graphics()
 
 
 def _usable_cache(wanted: str | None) -> str:
@@ -102,3 +104,21 @@ def check_versions(backend: str) -> None:
             f"dcc_jax: jax {version} hangs for ever on the CPU backend; "
             "install jax 0.9.2, or 0.12 and later"
         )
+
+
+def check_graphics() -> None:
+    """Finds out whether MuJoCo can be imported with the OpenGL that MUJOCO_GL names.
+
+    Raises:
+        ValueError: it cannot: the name is unknown, or its library is not installed.
+    """
+    wanted = os.environ.get("MUJOCO_GL")
+    if not wanted:
+        return
+    try:
+        importlib.import_module("mujoco")
+    except Exception as error:  # AttributeError where a library is missing
+        raise ValueError(
+            f"mujoco cannot be imported with MUJOCO_GL={wanted} ({error}); "
+            "unset it, or install that OpenGL library"
+        ) from None
