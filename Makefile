@@ -1,8 +1,17 @@
 # `make test` and `make run` work on a fresh machine: they create .venv and install.
+# Another interpreter: `make test PYTHON=python3.13`.
 PYTHON ?= python3
+VERSION := $(shell $(PYTHON) -c "import sys; print('%d.%d' % sys.version_info[:2])")
+# jax 0.11 and later, and numpy 2.5, need Python 3.12.
+CONSTRAINTS := constraints/python$(if $(filter 3.11,$(VERSION)),3.11,3.13).txt
 VENV := .venv
 BIN := $(VENV)/bin
-STAMP := $(VENV)/.installed
+STAMP := $(VENV)/.installed-$(VERSION)
+# Another interpreter's packages go.
+FRESH := $(if $(wildcard $(VENV)/lib/python$(VERSION)),,--clear)
+# pip stops where there is no home directory, as under many service accounts.
+HOME ?= $(CURDIR)/$(VENV)
+export HOME
 # `make run`: about five minutes of learning on two cores, at levels of compliance that
 # are learned in that time (0.16 takes half an hour).
 RUN := runs/trampoline-$(shell date +%Y%m%d-%H%M%S)
@@ -13,10 +22,11 @@ LEVELS := --env.alpha 0 --env.alpha-max 0.04
 
 setup: $(STAMP)
 
-$(STAMP): pyproject.toml constraints.txt
-	$(PYTHON) -m venv $(VENV)
+$(STAMP): pyproject.toml $(CONSTRAINTS)
+	$(if $(VERSION),,$(error PYTHON=$(PYTHON) is no Python interpreter))
+	$(PYTHON) -m venv $(FRESH) $(VENV)
 	$(BIN)/pip install --quiet --upgrade pip
-	$(BIN)/pip install --quiet -c constraints.txt -e ".[dev,video]"
+	$(BIN)/pip install --quiet -c $(CONSTRAINTS) -e ".[dev,video]"
 	touch $(STAMP)
 
 run: setup

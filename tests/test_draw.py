@@ -203,7 +203,7 @@ def test_wrong_shapes_are_refused(model):
 
 def test_machine_without_display_is_asked_once():
     """MuJoCo aborts the process when it fails to draw a second time."""
-    code = "from dcc_jax import draw; draw.opengl_works(); draw.opengl_works()"
+    code = "from dcc_jax.viz import draw; draw.opengl_works(); draw.opengl_works()"
     environment = {k: v for k, v in os.environ.items() if k != "DISPLAY"}
     done = subprocess.run(
         [sys.executable, "-c", code],
@@ -215,6 +215,56 @@ def test_machine_without_display_is_asked_once():
     assert done.returncode == 0, done.stderr
     if sys.platform == "linux":
         assert done.stderr.count("drawing with matplotlib") == 1
+
+
+@pytest.mark.parametrize("libraries", ["all", "none"])
+def test_drawing_leaves_the_environment_to_the_caller_and_its_children(libraries):
+    """A child that inherits a MUJOCO_GL without its library cannot import mujoco."""
+    code = """
+import os, subprocess, sys
+from dcc_jax.viz import draw
+if sys.argv[1] == "none":
+    draw.find_library = lambda name: None
+before = dict(os.environ)
+draw.opengl_works()
+assert dict(os.environ) == before, set(os.environ.items()) ^ set(before.items())
+subprocess.run([sys.executable, "-c", "import mujoco"], check=True)
+"""
+    hidden = ("DISPLAY", "MUJOCO_GL", "PYOPENGL_PLATFORM")
+    done = subprocess.run(
+        [sys.executable, "-c", code, libraries],
+        env={k: v for k, v in os.environ.items() if k not in hidden},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    if libraries == "none" and sys.platform == "linux":
+        assert "no display, no libOSMesa and no libEGL" in done.stderr
+
+
+def test_only_our_own_renderer_is_given_another_context(model, monkeypatch):
+    """The caller's `mujoco.Renderer` draws with what MuJoCo chose for it."""
+    chosen = sys.modules[mujoco.Renderer.__module__].gl_context
+    before, used = chosen.GLContext, []
+    context = object()
+    monkeypatch.setattr(draw, "_headless_context", lambda: context)
+    monkeypatch.setattr(
+        mujoco,
+        "Renderer",
+        type(
+            "Renderer",
+            (mujoco.Renderer,),
+            {
+                "__module__": mujoco.Renderer.__module__,
+                "__init__": lambda self, *_, **__: used.append(chosen.GLContext),
+                "__del__": lambda self: None,
+            },
+        ),
+    )
+    draw._renderer(model, 8, 8)
+    assert used == [context]
+    assert chosen.GLContext is before
 
 
 def test_video_holds_every_frame(tmp_path):
@@ -232,3 +282,22 @@ def test_missing_video_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(ModuleNotFoundError, match=r"dcc-jax\[video\]"):
         draw.write_mp4(tmp_path / "clip.mp4", iter([]), fps=30)
+
+
+def test_missing_ffmpeg_is_told_before_the_work(tmp_path, monkeypatch):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+
+    def missing():
+        raise RuntimeError("No ffmpeg exe could be found")
+
+    monkeypatch.setattr(ffmpeg, "get_ffmpeg_exe", missing)
+    with pytest.raises(OSError, match=r"clip.mp4 needs ffmpeg: No ffmpeg exe"):
+        draw.check_video(tmp_path / "clip.mp4")
+
+
+def test_unwritable_folder_of_a_video_is_told_before_the_work(tmp_path, monkeypatch):
+    pytest.importorskip("imageio_ffmpeg")
+    # To root every folder is writable.
+    monkeypatch.setattr(draw.os, "access", lambda path, mode: path != tmp_path)
+    with pytest.raises(PermissionError, match=r"clip.mp4 cannot be written"):
+        draw.check_video(tmp_path / "clip.mp4")

@@ -68,6 +68,13 @@ def test_run_directory_in_use_is_not_overwritten(capsys, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["precious.txt"]
 
 
+def test_run_directory_that_cannot_be_made_is_one_line(capsys, tmp_path):
+    (tmp_path / "file").write_text("no folder")
+    line = _said(capsys, [*SMOKE, "--run-dir", str(tmp_path / "file" / "run")])
+    assert "file/run cannot be written" in line
+    assert "--run-dir DIR names another place" in line
+
+
 def test_resumed_run_cannot_change_its_networks(capsys, tmp_path):
     (tmp_path / "config.json").write_text(
         config.to_json(config.make_config("push", "smoke"))

@@ -6,6 +6,7 @@ does not: importing dcc_jax changes nothing in the caller's process.
 
 from __future__ import annotations
 
+import importlib
 import importlib.metadata
 import os
 import sys
@@ -32,11 +33,12 @@ def setup(*, devices: int | None = None, cache_dir: str | None = None) -> None:
         devices: host devices on a CPU; default one per core this process may use, or
             what `DCC_JAX_DEVICES` says.
         cache_dir: of compiled programs; default `DCC_JAX_CACHE`, else
-            `~/.cache/dcc_jax`. An empty string switches the cache off.
+            `~/.cache/dcc_jax`. An empty string switches the cache off; where nothing
+            can be written it is off with a word.
 
     Raises:
         RuntimeError: jax is imported already.
-        ValueError: `devices` is not positive.
+        ValueError: `devices` is not positive; MUJOCO_GL names what is not there.
         SystemExit: this version of jax hangs on this backend.
     """
     if "jax" in sys.modules:
@@ -46,15 +48,33 @@ def setup(*, devices: int | None = None, cache_dir: str | None = None) -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     import jax
 
-    if cache_dir is None:
-        cache_dir = os.environ.get(
-            "DCC_JAX_CACHE", str(Path.home() / ".cache" / "dcc_jax")
-        )
-    if cache_dir:
+    if cache_dir := _usable_cache(cache_dir):
         jax.config.update("jax_compilation_cache_dir", cache_dir)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
     jax.config.update("jax_default_matmul_precision", "highest")
     check_versions(jax.default_backend())
+    check_graphics()
+
+
+def _usable_cache(wanted: str | None) -> str:
+    """The folder of compiled programs, made; "" where there cannot be one."""
+    chosen = os.environ.get("DCC_JAX_CACHE") if wanted is None else wanted
+    if chosen == "":
+        return ""
+    try:
+        # Path.home() fails for a user without a home, as in many containers.
+        folder = Path(chosen) if chosen else Path.home() / ".cache" / "dcc_jax"
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            raise PermissionError(f"{folder} is not writable")
+    except (OSError, RuntimeError) as error:
+        print(
+            f"dcc_jax: compiled programs are not kept, so every start compiles anew "
+            f"({error}); DCC_JAX_CACHE=DIR keeps them",
+            file=sys.stderr,
+        )
+        return ""
+    return str(folder)
 
 
 def _set_host_devices(devices: int | None) -> None:
@@ -84,3 +104,21 @@ def check_versions(backend: str) -> None:
             f"dcc_jax: jax {version} hangs for ever on the CPU backend; "
             "install jax 0.9.2, or 0.12 and later"
         )
+
+
+def check_graphics() -> None:
+    """Finds out whether MuJoCo can be imported with the OpenGL that MUJOCO_GL names.
+
+    Raises:
+        ValueError: it cannot: the name is unknown, or its library is not installed.
+    """
+    wanted = os.environ.get("MUJOCO_GL")
+    if not wanted:
+        return
+    try:
+        importlib.import_module("mujoco")
+    except Exception as error:  # AttributeError where a library is missing
+        raise ValueError(
+            f"mujoco cannot be imported with MUJOCO_GL={wanted} ({error}); "
+            "unset it, or install that OpenGL library"
+        ) from None

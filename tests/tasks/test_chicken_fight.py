@@ -180,7 +180,8 @@ def test_attacks_come_from_all_sides_at_the_character(scene, began, attacks):
     speed = np.linalg.norm(velocity, axis=-1)
     slow, fast = TASK.speed
     assert slow <= speed.min() < slow + 0.05 and fast - 0.05 < speed.max() <= fast
-    aside = np.abs(np.cross(offset, velocity)) / speed
+    cross = offset[:, 0] * velocity[:, 1] - offset[:, 1] * velocity[:, 0]
+    aside = np.abs(cross) / speed
     assert 0.5 * TASK.off_centre < aside.max() <= TASK.off_centre + 1e-5
     np.testing.assert_allclose(
         -np.sum(offset * velocity, axis=-1) / speed, TASK.distance, atol=1e-5

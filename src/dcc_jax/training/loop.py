@@ -103,11 +103,22 @@ def prepare(
         environment = make_environment(wanted)
     mesh = learner.make_mesh(wanted.train)
     learner.check_sizes(wanted, mesh.size)
-    run_dir.mkdir(parents=True, exist_ok=True)
-    checkpoint.write_atomically(
-        run_dir / "config.json", config.to_json(wanted).encode()
-    )
+    _begin(run_dir, wanted)
     return Run(wanted, run_dir, environment, mesh, resume)
+
+
+def _begin(run_dir: Path, wanted: Config) -> None:
+    """Makes the run directory with its configuration."""
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
+        checkpoint.write_atomically(
+            run_dir / "config.json", config.to_json(wanted).encode()
+        )
+    except OSError as error:
+        raise ValueError(
+            f"run_dir {run_dir} cannot be written ({error.strerror}); "
+            "--run-dir DIR names another place"
+        ) from None
 
 
 def default_run_dir(task: str) -> Path:

@@ -1,7 +1,8 @@
 """Pictures of a MuJoCo model along a motion, and videos of them.
 
-MuJoCo's offscreen renderer draws where OpenGL works (`MUJOCO_GL=osmesa` or `egl`);
-elsewhere matplotlib draws the shapes of the bodies.
+MuJoCo's offscreen renderer draws where there is a display, libOSMesa or libEGL;
+elsewhere matplotlib draws the shapes of the bodies. `MUJOCO_GL` decides
+where it is set.
 """
 
 from __future__ import annotations
@@ -93,7 +94,6 @@ def frames(
     if fallback:
         images = plain_frames(poses, cameras, GHOST)
     else:
-        _choose_backend()
         images = _opengl_frames(poses, view, looked_at, size)
     return _annotated(images, cameras, arrows, captions)
 
@@ -121,31 +121,64 @@ def opengl_works() -> bool:
 
     Asked once: after a failure MuJoCo aborts the process at the next attempt.
     """
-    _choose_backend()
     try:
         probe = mujoco.MjModel.from_xml_string("<mujoco><worldbody/></mujoco>")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # glfw tells at length
-            mujoco.Renderer(probe, 8, 8).close()
+            _renderer(probe, 8, 8).close()
         return True
     except Exception as error:  # every GL backend fails with a type of its own
         print(f"no OpenGL here ({error}): drawing with matplotlib", file=sys.stderr)
         return False
 
 
-def _choose_backend() -> None:
-    """Picks a headless OpenGL when none was chosen and there is no display.
+def _renderer(
+    model: mujoco.MjModel, height: int, width: int, **options: Any
+) -> mujoco.Renderer:
+    """MuJoCo's renderer, without a display where there is none.
 
-    MuJoCo reads MUJOCO_GL when it is imported, so its choice has to be made again.
+    MuJoCo chooses its OpenGL by MUJOCO_GL when it is imported. To set that variable
+    here would be too late, and would reach every child process. So the renderer is
+    given another context while it is made.
     """
-    if sys.platform != "linux":
-        return
-    if "MUJOCO_GL" in os.environ or os.environ.get("DISPLAY"):
-        return
-    os.environ["MUJOCO_GL"] = "osmesa" if find_library("OSMesa") else "egl"
-    renderer = sys.modules[mujoco.Renderer.__module__]
-    with contextlib.suppress(Exception):
-        importlib.reload(renderer.gl_context)
+    context = _headless_context()
+    if context is None:
+        return mujoco.Renderer(model, height, width, **options)
+    chosen = sys.modules[mujoco.Renderer.__module__].gl_context
+    before, chosen.GLContext = chosen.GLContext, context
+    try:
+        return mujoco.Renderer(model, height, width, **options)
+    finally:
+        chosen.GLContext = before
+
+
+@cache
+def _headless_context() -> Any:
+    """MuJoCo's context for drawing without a display; None: the one it chose itself.
+
+    Raises:
+        RuntimeError: neither a display nor a library that does without.
+    """
+    said = os.environ.get("MUJOCO_GL") or os.environ.get("DISPLAY")
+    if sys.platform != "linux" or said:
+        return None
+    for name in ("OSMesa", "EGL"):
+        if find_library(name):
+            with _environment_restored("PYOPENGL_PLATFORM"):
+                return importlib.import_module(f"mujoco.{name.lower()}").GLContext
+    raise RuntimeError("no display, no libOSMesa and no libEGL")
+
+
+@contextlib.contextmanager
+def _environment_restored(name: str) -> Iterator[None]:
+    """Undoes what is done to an environment variable, for the sake of children."""
+    before = os.environ.get(name)
+    try:
+        yield
+    finally:
+        os.environ.pop(name, None)
+        if before is not None:
+            os.environ[name] = before
 
 
 def _follow(model: mujoco.MjModel, qpos: np.ndarray, view: View) -> np.ndarray:
@@ -173,7 +206,7 @@ def _opengl_frames(
     camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
     camera.azimuth, camera.elevation = view.azimuth, view.elevation
     camera.distance = view.distance
-    with mujoco.Renderer(model, height, width, max_geom=4000) as renderer:
+    with _renderer(model, height, width, max_geom=4000) as renderer:
         for (data, ghost), point in zip(poses, looked_at, strict=True):
             camera.lookat[:] = point
             renderer.update_scene(data, camera, option)
@@ -203,14 +236,21 @@ def check_video(path: str | Path) -> None:
 
     Raises:
         ModuleNotFoundError: the `video` extra is not installed.
+        OSError: there is no ffmpeg, or the folder cannot be written to.
     """
     try:
         import imageio.v2  # noqa: F401
-        import imageio_ffmpeg  # noqa: F401
+        import imageio_ffmpeg
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
             f"writing {path} needs {error.name}: pip install 'dcc-jax[video]'"
         ) from None
+    try:
+        imageio_ffmpeg.get_ffmpeg_exe()
+    except RuntimeError as error:
+        raise OSError(f"writing {path} needs ffmpeg: {error}") from None
+    if not os.access(Path(path).parent, os.W_OK):
+        raise PermissionError(f"{path} cannot be written there: choose another place")
 
 
 def write_mp4(path: str | Path, images: Iterator[np.ndarray], fps: float) -> None:
@@ -218,11 +258,12 @@ def write_mp4(path: str | Path, images: Iterator[np.ndarray], fps: float) -> Non
 
     Raises:
         ModuleNotFoundError: the `video` extra is not installed.
+        OSError: there is no ffmpeg, or the file cannot be written.
     """
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
     check_video(path)
     import imageio.v2 as imageio
 
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
     with warnings.catch_warnings():
         # jax warns of any child process; ffmpeg shares nothing with it.
         warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called")
