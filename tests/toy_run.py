@@ -14,11 +14,11 @@ def toy_config(updates: int):
     import dataclasses
 
     from dcc_jax.config import Config
-    from toy import ToyConfig
+    from toy import ToyConfig, ToyTask
 
     small = ToyConfig()
     return Config(
-        task="toy",
+        task=ToyTask(),
         ppo=small.ppo,
         disc=small.disc,
         train=dataclasses.replace(

@@ -12,7 +12,7 @@ from typing import Annotated, NoReturn
 
 import tyro
 
-from dcc_jax import config
+from dcc_jax import config, tasks
 from dcc_jax.config import Config
 from dcc_jax.training.loop import default_run_dir
 
@@ -48,12 +48,26 @@ def parse(argv: Sequence[str]) -> Options:
     if first.resume:
         if first.run_dir is None:
             raise ValueError("--resume needs --run-dir, the run to continue")
-        base = config.load(Path(first.run_dir))
+        base = _retasked(config.load(Path(first.run_dir)), first.task)
     elif first.task is None and not first.help:
         raise ValueError("--task is required; see --help")
     else:
         base = config.make_config(first.task or "trampoline", first.preset or "cpu")
-    return _full_look(argv, base)
+    return _full_look(_without_task(argv), base)
+
+
+def _retasked(base: Config, task: str | None) -> Config:
+    """The run to continue, with the task that is asked for where that is another."""
+    if task in (None, base.task.name, tasks.task_name(base.task)):
+        return base
+    return base.with_({"task": task})
+
+
+def _without_task(argv: Sequence[str]) -> list[str]:
+    """`--task NAME` has chosen the section; what is left of it are its parameters."""
+    parser = _Raising(add_help=False, allow_abbrev=False)
+    parser.add_argument("--task")
+    return parser.parse_known_args(argv)[1]
 
 
 def _first_look(argv: Sequence[str]) -> argparse.Namespace:
@@ -76,7 +90,7 @@ def _full_look(argv: Sequence[str], base: Config) -> Options:
                 prog=PROGRAM,
                 description=_DESCRIPTION,
                 args=list(argv),
-                default=Options(config=base, run_dir=default_run_dir(base.task)),
+                default=Options(config=base, run_dir=default_run_dir(base.task.name)),
             )
     except SystemExit as stop:
         if stop.code in (0, None):

@@ -10,34 +10,11 @@ import contextlib
 import sys
 import traceback
 from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 from dcc_jax import command, runtime
 from dcc_jax.training import curves
 
-if TYPE_CHECKING:
-    from dcc_jax.config import Config
-    from dcc_jax.learn.rollout import Environment
-    from dcc_jax.training.loop import TrainResult
-
 PROGRAM = "dcc_jax.train"
-
-
-def train(
-    config: Config,
-    *,
-    run_dir: Path | str | None = None,
-    resume: bool = False,
-    environment: Environment | None = None,
-    quiet: bool = False,
-) -> TrainResult:
-    """Trains a policy; `dcc_jax.training.loop.train` says what the arguments are."""
-    from dcc_jax.training import loop
-
-    return loop.train(
-        config, run_dir=run_dir, resume=resume, environment=environment, quiet=quiet
-    )
 
 
 def main(argv: Sequence[str] | None = None) -> int:

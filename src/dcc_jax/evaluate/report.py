@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -55,7 +55,7 @@ def evaluate(
     alpha: Sequence[float] | None = None,
     seed: int = 0,
     seconds: float | None = None,
-    task: Task | None = None,
+    task: Mapping[str, Any] | Task | None = None,
     say: Callable[[str], None] = lambda _: None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Report:
@@ -70,7 +70,7 @@ def evaluate(
         alpha: levels of compliance; None: the least and the greatest of the training.
         seed: of everything that is drawn.
         seconds: length of an episode; None: as in training.
-        task: in place of the configured one, e.g. with other parameters.
+        task: other parameters of the run's task, `{"width": 1.5}`, or another task.
         say: told what a reader of the numbers has to know.
         progress: told control steps done and to be done.
 
@@ -98,7 +98,7 @@ def prepare(
     alpha: Sequence[float] | None,
     seed: int,
     seconds: float | None,
-    task: Task | None,
+    task: Mapping[str, Any] | Task | None,
     say: Callable[[str], None],
 ) -> EvaluationPlan:
     """Checks everything a user can get wrong; arguments as of `evaluate`."""
@@ -159,7 +159,7 @@ def _check(
         raise ValueError(f"seconds must be in [0.1, 3600], got {seconds}")
     if len({run.name for run in runs}) < len(runs):
         raise ValueError(f"a run is given twice: {', '.join(r.name for r in runs)}")
-    tasks = sorted({run.config.task for run in runs})
+    tasks = sorted({run.config.task.name for run in runs})
     if len(tasks) > 1:
         raise ValueError(f"the runs must be of one task, got {', '.join(tasks)}")
 
@@ -180,13 +180,16 @@ def _levels(
     return [float(level) for level in alpha]
 
 
-def _players(runs: list[Run], task: Task | None) -> dict[str, Player]:
+def _players(
+    runs: list[Run], task: Mapping[str, Any] | Task | None
+) -> dict[str, Player]:
     """By run. Runs whose environments differ in alpha alone share a program."""
     shared: dict[str, Player] = {}
     players = {}
     for run in runs:
         environment = make_environment(run, task)
-        same = repr(asdict(run.config.env) | {"alpha": None, "alpha_max": None})
+        env = asdict(run.config.env) | {"alpha": None, "alpha_max": None}
+        same = repr((environment.task, env))
         players[run.name] = shared.setdefault(same, Player(environment))
     return players
 

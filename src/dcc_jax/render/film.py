@@ -6,9 +6,10 @@ Letters: T frames, one a control step.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -58,7 +59,7 @@ def render(
     alpha: float | None = None,
     seed: int = 0,
     strip: str | Path | None = None,
-    task: Task | None = None,
+    task: Mapping[str, Any] | Task | None = None,
 ) -> None:
     """Films the mean action of a policy.
 
@@ -69,7 +70,7 @@ def render(
         alpha: level of compliance; None: the greatest of the training.
         seed: of everything that is drawn.
         strip: a picture of frames side by side.
-        task: in place of the configured one, e.g. with other parameters.
+        task: other parameters of the run's task, `{"width": 1.5}`, or another task.
 
     Raises:
         ValueError: naming the argument, its value and what is allowed.
@@ -86,7 +87,7 @@ def prepare(
     alpha: float | None,
     seed: int,
     strip: str | Path | None,
-    task: Task | None,
+    task: Mapping[str, Any] | Task | None,
 ) -> FilmPlan:
     """Checks everything a user can get wrong; arguments as of `render`."""
     if not 0.1 <= seconds <= 3600.0:
@@ -239,7 +240,7 @@ def _captions(
 ) -> list[str]:
     numbers = {name: x[times, episodes] for name, x in recording.numbers.items()}
     alive = recording.alive[times, episodes]
-    head = f"{plan.run.config.task}  alpha {plan.alpha:g}"
+    head = f"{plan.player.environment.task.name}  alpha {plan.alpha:g}"
     return [
         f"{head}  {(time + 1) / CONTROL_RATE:.2f} s"
         f"  force {numbers['force_peak'][i]:.0f} N"

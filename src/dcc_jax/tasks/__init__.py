@@ -10,39 +10,22 @@ from dcc_jax.env.environment import Environment
 from dcc_jax.env.task import Task
 from dcc_jax.motion.clip import Clip, load_clip
 from dcc_jax.motion.reference import make_references
-from dcc_jax.tasks.backflip import Backflip
-from dcc_jax.tasks.ball import Ball
-from dcc_jax.tasks.chicken_fight import ChickenFight
-from dcc_jax.tasks.door import Door
-from dcc_jax.tasks.hand_in_hand import HandInHand
-from dcc_jax.tasks.push import Push
-from dcc_jax.tasks.sustained_push import SustainedPush
-from dcc_jax.tasks.trampoline import Trampoline
+from dcc_jax.tasks.registry import (
+    TASKS,
+    find_task,
+    make_task,
+    register_task,
+    task_name,
+)
 
-TASKS: dict[str, type[Task]] = {
-    task.name: task
-    for task in (
-        Push,
-        SustainedPush,
-        Trampoline,
-        Backflip,
-        HandInHand,
-        ChickenFight,
-        Door,
-        Ball,
-    )
-}
-
-
-def make_task(name: str) -> Task:
-    """The task called `name`, with its defaults.
-
-    Raises:
-        ValueError: there is none; the message lists them.
-    """
-    if name not in TASKS:
-        raise ValueError(f"task must be one of {', '.join(TASKS)}, got {name!r}")
-    return TASKS[name]()
+__all__ = [
+    "TASKS",
+    "find_task",
+    "make_environment",
+    "make_task",
+    "register_task",
+    "task_name",
+]
 
 
 def make_environment(task: Task, config: EnvConfig) -> Environment:

@@ -91,7 +91,7 @@ def prepare(
     if run_dir is None:
         if resume:
             raise ValueError("resume needs run_dir: the run to continue")
-        run_dir = default_run_dir(wanted.task)
+        run_dir = default_run_dir(wanted.task.name)
     run_dir = Path(run_dir)
     if resume:
         _check_resumable(config.load(run_dir), wanted, run_dir)
@@ -269,9 +269,9 @@ def make_environment(wanted: Config) -> Environment:
     """The environment of a configuration's task.
 
     Raises:
-        ValueError: an unknown task, or clips that are missing or damaged.
+        ValueError: clips that are missing or damaged.
     """
-    return tasks.make_environment(tasks.make_task(wanted.task), wanted.env)
+    return tasks.make_environment(wanted.task, wanted.env)
 
 
 def _check_resumable(old: Config, new: Config, run_dir: Path) -> None:
