@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import sys
 
-from dcc_jax import runtime
-
 INTERVAL = 10
 
 
@@ -30,7 +28,6 @@ def toy_config(updates: int):
 
 
 def main(arguments: list[str]) -> int:
-    runtime.setup()
     from dcc_jax.training import loop
     from toy import Toy
 

@@ -44,6 +44,8 @@ _HOMES = {
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'dcc_jax' has no attribute {name!r}")
+    runtime = importlib.import_module("dcc_jax.runtime")
+    runtime.import_jax()
     return getattr(importlib.import_module(f"dcc_jax.{_HOMES[name]}"), name)
 
 

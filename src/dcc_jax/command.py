@@ -40,8 +40,7 @@ def run(
     program = parser.prog.removeprefix("python -m ")
     try:
         options = parser.parse_args(argv)
-        if "jax" not in sys.modules:
-            runtime.setup()
+        runtime.ensure()
         prepared = prepare(options)
     except (ValueError, OSError, ModuleNotFoundError) as error:
         return complain(program, str(error), 2)

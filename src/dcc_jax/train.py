@@ -1,7 +1,7 @@
 """`python -m dcc_jax.train`: trains a policy; `--help` lists every option.
 
 The loop itself is in `dcc_jax.training.loop`. This file imports nothing heavy before
-`runtime.setup()` has told JAX how many devices there are.
+`runtime.import_jax()` has chosen how much jax says.
 """
 
 from __future__ import annotations
@@ -20,8 +20,7 @@ PROGRAM = "dcc_jax.train"
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
     try:
-        if "jax" not in sys.modules:
-            runtime.setup()
+        runtime.import_jax()
         from dcc_jax import options
         from dcc_jax.training import loop
 

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dcc_jax import runtime
 from dcc_jax.env.config import CONTROL_RATE
 from dcc_jax.env.task import Task
 from dcc_jax.evaluate import bootstrap, compare, measures
@@ -52,7 +53,7 @@ def evaluate(
     run_dir: str | Path | Sequence[str | Path],
     *,
     episodes: int = 256,
-    alpha: Sequence[float] | None = None,
+    alpha: float | Sequence[float] | None = None,
     seed: int = 0,
     seconds: float | None = None,
     task: Mapping[str, Any] | Task | None = None,
@@ -67,7 +68,7 @@ def evaluate(
     Args:
         run_dir: a run directory, a policy that ships, or several of them.
         episodes: of each condition.
-        alpha: levels of compliance; None: the least and the greatest of the training.
+        alpha: levels of compliance, or one; None: the least and the greatest of the training.
         seed: of everything that is drawn.
         seconds: length of an episode; None: as in training.
         task: other parameters of the run's task, `{"width": 1.5}`, or another task.
@@ -95,15 +96,18 @@ class EvaluationPlan:
 def prepare(
     run_dir: str | Path | Sequence[str | Path],
     episodes: int,
-    alpha: Sequence[float] | None,
+    alpha: float | Sequence[float] | None,
     seed: int,
     seconds: float | None,
     task: Mapping[str, Any] | Task | None,
     say: Callable[[str], None],
 ) -> EvaluationPlan:
     """Checks everything a user can get wrong; arguments as of `evaluate`."""
+    runtime.ensure()
     names = [run_dir] if isinstance(run_dir, str | Path) else list(run_dir)
     runs = [find_run(name) for name in names]
+    if isinstance(alpha, float | int):
+        alpha = [alpha]
     _check(runs, episodes, alpha, seed, seconds)
     return EvaluationPlan(
         conditions=[(run, level) for run in runs for level in _levels(run, alpha, say)],

@@ -14,7 +14,7 @@ from dcc_jax.config import Config
 from dcc_jax.env.environment import Environment
 from dcc_jax.env.task import Task
 from dcc_jax.learn.rollout import Policy
-from dcc_jax.training import checkpoint
+from dcc_jax.training import checkpoint, folder
 
 _FOREVER = 1e6  # s
 
@@ -38,11 +38,14 @@ def find_run(name: str | Path) -> Run:
     """The policy in a run directory, or one of those that ship, by path or name.
 
     Raises:
-        ValueError: there is none, or it is damaged.
+        ValueError: there is none, or it is damaged, or there are the many of a sweep.
     """
     path = Path(name)
     if not path.exists():
         path = _shipped(str(name))
+    if (path / folder.SWEEP).exists():
+        within = ", ".join(sorted(p.parent.name for p in path.glob("*/policy.npz")))
+        raise ValueError(f"{name} is a sweep; its runs are {within or 'not begun'}")
     return Run(str(name), config.load(path), checkpoint.load_policy(path))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from dcc_jax import runtime
 from dcc_jax.character import asset_path, load_character
 from dcc_jax.env.config import EnvConfig
 from dcc_jax.env.environment import Environment
@@ -35,6 +36,7 @@ def make_environment(task: Task, config: EnvConfig) -> Environment:
         ValueError: clips that are missing or do not suit the task.
         MotionError: a clip that cannot be read.
     """
+    runtime.ensure()
     try:
         references = make_references(_clips(task, config))
     except FileNotFoundError as error:
