@@ -20,7 +20,7 @@ LEVELS = [
     {"physics", "control", "motion", "command"},
     {"motion.retarget", "env"},
     {"motion.inspect", "tasks"},
-    {"motion.inspect_command", "learn"},
+    {"motion.__main__", "motion.inspect_command", "learn"},
     {"config"},
     {"training"},
     {"play", "options"},
