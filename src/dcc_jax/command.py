@@ -221,7 +221,8 @@ def _sentence(box: str) -> str:
     """
     lines = [line for line in box.splitlines() if line.strip()]
     rules = [i for i, line in enumerate(lines) if not line.strip(" -─╭╮╰╯")]
-    body = lines[rules[0] + 1 : rules[1]] if len(rules) > 1 else lines
+    begin = rules[0] + 1 if rules else 0
+    body = lines[begin : rules[1] if len(rules) > 1 else None]
     first, *others = [
         line.strip() for line in body if not line.startswith(10 * " ")
     ] or [""]
