@@ -18,7 +18,9 @@ from tyro.conf import Positional
 
 from dcc_jax import __main__ as main
 from dcc_jax import command
+from dcc_jax.evaluate import __main__ as evaluate
 from dcc_jax.motion import __main__ as motion
+from dcc_jax.play import overrides
 
 ROOT = Path(__file__).resolve().parents[1]
 CLIP = ROOT / "assets" / "motions" / "walk.npz"
@@ -268,3 +270,39 @@ def test_help_needs_no_jax(words):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True)
     assert done.returncode == 0, done.stderr
+
+
+def read(*argv: str) -> evaluate.Options:
+    return overrides.read(evaluate.PROGRAM, evaluate.Options, argv)
+
+
+def test_parameters_of_the_task_are_kept_for_when_it_is_known():
+    said = read("door", "push", "--task.width", "1.5", "--seed", "3", "--task.reach=1")
+    assert said.run_dir == ("door", "push") and said.seed == 3
+    assert said.task == ("--task.width", "1.5", "--task.reach=1")
+
+
+def test_parameters_are_read_as_the_task_of_the_run_has_them():
+    for name, arguments, wanted in (
+        ("door", ("--task.width", "1.5", "--task.reach=1"), {"width": 1.5, "reach": 1}),
+        ("push", ("--task.speed", "1", "2"), {"speed": (1.0, 2.0)}),
+        ("push", (), {}),
+    ):
+        assert overrides.changes(evaluate.PROGRAM, name, arguments) == wanted
+    # A value as it was trained counts: another run may have been trained otherwise.
+    same = overrides.changes(evaluate.PROGRAM, "door", ("--task.width", "1.0"))
+    assert same == {"width": 1.0}
+
+
+@pytest.mark.parametrize("words", [("evaluate",), ("render",)])
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["--task.width", "wide"], "--task.width: could not convert"),
+        (["--task.wdth", "2"], "Unrecognized options: --task.wdth"),
+        (["--task.width", "-1"], "width must be positive, got -1.0"),
+        (["--task.width"], "Missing value for argument '--task.width'"),
+    ],
+)
+def test_bad_parameter_of_the_task_is_one_line(words, arguments, part, capsys):
+    assert part in complaint(capsys, words, "door", *arguments)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from dcc_jax import command
+from dcc_jax.play import overrides
 
 if TYPE_CHECKING:
     from dcc_jax.evaluate.report import EvaluationPlan
@@ -50,6 +51,8 @@ class Options:
     seed: Annotated[int, arg(metavar="N")] = 0
     """Of everything that is drawn."""
 
+    task: overrides.TaskParameters = ()
+
     json: Annotated[
         Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")
     ] = None
@@ -69,7 +72,7 @@ class Options:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
-    return command.run(PROGRAM, argv, partial(command.parse, PROGRAM, Options), _plan)
+    return command.run(PROGRAM, argv, partial(overrides.read, PROGRAM, Options), _plan)
 
 
 def _plan(options: Options) -> command.Work:
@@ -87,7 +90,7 @@ def _plan(options: Options) -> command.Work:
         options.alpha,
         options.seed,
         options.seconds,
-        None,
+        overrides.changes(PROGRAM, options.run_dir[0], options.task),
         lambda text: print(text, file=sys.stderr),
     )
     return partial(_measure, plan, options)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from dcc_jax import command
+from dcc_jax.play import overrides
 
 if TYPE_CHECKING:
     from dcc_jax.render.film import FilmPlan
@@ -51,6 +52,8 @@ class Options:
     seed: Annotated[int, arg(metavar="N")] = 0
     """Of everything that is drawn."""
 
+    task: overrides.TaskParameters = ()
+
     strip: Annotated[
         Path | None, arg(metavar="FILE.png", help_behavior_hint="(default: none)")
     ] = None
@@ -59,14 +62,15 @@ class Options:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
-    return command.run(PROGRAM, argv, partial(command.parse, PROGRAM, Options), _plan)
+    return command.run(PROGRAM, argv, partial(overrides.read, PROGRAM, Options), _plan)
 
 
 def _plan(options: Options) -> command.Work:
     command.start_jax()
     from dcc_jax.render import film
 
-    return partial(_film, film.prepare(**vars(options), task=None))
+    task = overrides.changes(PROGRAM, options.run_dir, options.task)
+    return partial(_film, film.prepare(**vars(options) | {"task": task}))
 
 
 def _film(plan: FilmPlan) -> None:
