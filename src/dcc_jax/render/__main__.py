@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
@@ -70,7 +70,8 @@ def _plan(options: Options) -> command.Work:
     from dcc_jax.render import film
 
     task = overrides.changes(PROGRAM, options.run_dir, options.task)
-    return partial(_film, film.prepare(**vars(options) | {"task": task}))
+    arguments: dict[str, Any] = {**vars(options), "task": task}
+    return partial(_film, film.prepare(**arguments))
 
 
 def _film(plan: FilmPlan) -> None:
