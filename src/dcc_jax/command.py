@@ -9,6 +9,7 @@ import contextlib
 import importlib
 import io
 import os
+import re
 import sys
 import tempfile
 import traceback
@@ -228,7 +229,9 @@ def _sentence(box: str) -> str:
     ] or [""]
     if first.startswith("Missing from"):
         return f"missing: {', '.join(others)}"
-    return " ".join([first, *others]).removeprefix("Error parsing ").rstrip(".")
+    text = " ".join([first, *others]).removeprefix("Error parsing ").rstrip(".")
+    # Of an option that may be None, what the other type says is what helps.
+    return re.sub(r"no type matching .* - .*?: ", "", text)
 
 
 @contextlib.contextmanager
