@@ -142,9 +142,8 @@ def _quietly(
 
 
 def start_jax() -> None:
-    """Imports and configures jax for a command."""
+    """Imports jax for a command; the library configures it when it is first used."""
     runtime.import_jax()
-    runtime.ensure()
 
 
 def complain(program: str, problem: str, status: int) -> int:
