@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dcc_jax import runtime
 
-runtime.setup()
+runtime.ensure()
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402

@@ -20,11 +20,11 @@ LEVELS = [
     {"physics", "control", "motion", "command"},
     {"motion.retarget", "env"},
     {"motion.inspect", "tasks"},
-    {"motion.__main__", "learn"},
+    {"motion.__main__", "motion.inspect_command", "learn"},
     {"config"},
     {"training"},
     {"play", "options"},
-    {"train", "evaluate", "render"},
+    {"train", "evaluate", "render", "__main__"},
 ]
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}
 FILES = sorted(PACKAGE.rglob("*.py"))

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
 import pytest
 
-from dcc_jax import config, options
+from dcc_jax import config, options, tasks
 from dcc_jax.training import loop
 
 # The package shows the function of that name; these tests want the module.
@@ -105,17 +107,48 @@ def test_options_override_the_preset():
     assert said.config.env == dataclasses.replace(made.env, alpha=0.04)
 
 
-def test_help_explains_every_option(capsys):
-    with pytest.raises(SystemExit) as stop:
-        options.parse(["--help", "--preset", "paper"])
-    assert stop.value.code == 0
-    text = " ".join(capsys.readouterr().out.split())
-    for option in ("--run-dir", "--resume", "--seed", "--env.alpha", "--disc.hidden"):
-        assert option in text
-    for source in ("Sec. 5.1", "Schulman 2017", "(default: 1e-05)"):
-        assert source in text
-    for section in (config.Config, *config.Config.__dataclass_fields__):
-        assert section
+def _names(section: object, prefix: str = "--") -> Iterator[str]:
+    """The flags of a configuration: every entry of every section."""
+    for entry in dataclasses.fields(section):
+        name, value = entry.name.replace("_", "-"), getattr(section, entry.name)
+        if dataclasses.is_dataclass(value):
+            yield from _names(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name
+
+
+def _help(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
+    assert train.main([*argv, "--help"]) == 0
+    return " ".join(re.sub("[│╭╮╰╯─]", " ", capsys.readouterr().out).split())
+
+
+def test_help_has_every_entry_of_every_section(capsys):
+    text = _help(capsys, "--task", "push")
+    names = list(_names(config.make_config("push")))
+    assert {name.partition(".")[0] for name in names} >= {"--env", "--ppo", "--train"}
+    for name in (*names, "--run-dir", "--resume"):
+        assert f" {name} " in text.replace(",", " "), name
+
+
+def test_help_cites_sources_and_shows_the_defaults_of_the_preset(capsys):
+    paper, cpu = (_help(capsys, "--preset", name) for name in ("paper", "cpu"))
+    for source in ("Sec. 5.1", "Schulman 2017"):
+        assert source in paper
+    default = r"--ppo\.value-learning-rate FLOAT .*?\(default: (\S+)\)"
+    rates = [re.search(default, text) for text in (paper, cpu)]
+    made = [config.make_config("trampoline", name) for name in ("paper", "cpu")]
+    assert [rate and float(rate[1]) for rate in rates] == [
+        one.ppo.value_learning_rate for one in made
+    ]
+    assert made[0].ppo.value_learning_rate != made[1].ppo.value_learning_rate
+
+
+def test_help_names_the_tasks_and_presets_that_are_allowed(capsys):
+    text = _help(capsys)
+    for flag, names in (("task", tasks.TASKS), ("preset", config.PRESETS)):
+        (said,) = re.findall(rf" --{flag} ([^(]*)", text)
+        for name in names:
+            assert re.search(rf"\b{name}\b", said), name
 
 
 def test_command_leaves_with_status_two():

@@ -50,6 +50,14 @@ def test_character_loads_from_an_installed_wheel(installed, tmp_path):
     assert nq == "55"
 
 
+def test_wheel_brings_the_command(installed, tmp_path):
+    """Its help needs nothing but tyro, and the installed package, not the checkout."""
+    env = {**os.environ, "PYTHONPATH": str(installed)}
+    script = str(installed / "bin" / "dcc-jax")
+    said = run(script, "evaluate", "--help", cwd=tmp_path, env=env)
+    assert said.startswith("usage: dcc-jax evaluate ")
+
+
 def test_wheel_is_typed_and_holds_every_module_and_asset(installed):
     assert (installed / "dcc_jax" / "py.typed").exists()
     for folder, top in (("src/dcc_jax", "dcc_jax"), ("assets", "dcc_jax/assets")):

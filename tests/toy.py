@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 
 from dcc_jax.env.rewards import RewardConfig
+from dcc_jax.env.task import Task
 from dcc_jax.learn.discriminator import DiscriminatorConfig
 from dcc_jax.learn.ppo import PpoConfig
 from dcc_jax.learn.state import TrainConfig
@@ -99,6 +101,13 @@ class Toy:
             metrics=ToyMetrics(distance=distance),
             time=time,
         )
+
+
+@dataclass(frozen=True)
+class ToyTask(Task):
+    """What a configuration of the toy names; the environment is given by hand."""
+
+    name: ClassVar[str] = "toy"
 
 
 @dataclass(frozen=True)

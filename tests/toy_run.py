@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import sys
 
-from dcc_jax import runtime
-
 INTERVAL = 10
 
 
@@ -14,11 +12,11 @@ def toy_config(updates: int):
     import dataclasses
 
     from dcc_jax.config import Config
-    from toy import ToyConfig
+    from toy import ToyConfig, ToyTask
 
     small = ToyConfig()
     return Config(
-        task="toy",
+        task=ToyTask(),
         ppo=small.ppo,
         disc=small.disc,
         train=dataclasses.replace(
@@ -30,7 +28,6 @@ def toy_config(updates: int):
 
 
 def main(arguments: list[str]) -> int:
-    runtime.setup()
     from dcc_jax.training import loop
     from toy import Toy
 

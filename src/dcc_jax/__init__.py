@@ -14,19 +14,29 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from dcc_jax.config import make_config
     from dcc_jax.control.stiffness import stiffness
-    from dcc_jax.evaluate import evaluate
-    from dcc_jax.render import render
-    from dcc_jax.train import train
+    from dcc_jax.evaluate.report import evaluate
+    from dcc_jax.render.film import render
+    from dcc_jax.tasks.registry import register_task
+    from dcc_jax.training.loop import train
     from dcc_jax.training.sweep import sweep
 
-__all__ = ["evaluate", "make_config", "render", "stiffness", "sweep", "train"]
+__all__ = [
+    "evaluate",
+    "make_config",
+    "register_task",
+    "render",
+    "stiffness",
+    "sweep",
+    "train",
+]
 
 _HOMES = {
     "make_config": "config",
-    "train": "train",
-    "evaluate": "evaluate",
-    "render": "render",
+    "train": "training.loop",
+    "evaluate": "evaluate.report",
+    "render": "render.film",
     "sweep": "training.sweep",
+    "register_task": "tasks.registry",
     "stiffness": "control.stiffness",
 }
 
@@ -34,6 +44,8 @@ _HOMES = {
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'dcc_jax' has no attribute {name!r}")
+    runtime = importlib.import_module("dcc_jax.runtime")
+    runtime.import_jax()
     return getattr(importlib.import_module(f"dcc_jax.{_HOMES[name]}"), name)
 
 

@@ -1,77 +1,58 @@
-"""`python -m dcc_jax.train`: trains a policy; `--help` lists every option.
+"""`dcc-jax train`: trains a policy; `--help` lists every option.
 
 The loop itself is in `dcc_jax.training.loop`. This file imports nothing heavy before
-`runtime.setup()` has told JAX how many devices there are.
+jax has been told how many devices there are.
 """
 
 from __future__ import annotations
 
-import contextlib
-import sys
-import traceback
 from collections.abc import Sequence
-from pathlib import Path
+from functools import partial
 from typing import TYPE_CHECKING
 
-from dcc_jax import command, runtime
+from dcc_jax import command
 from dcc_jax.training import curves
 
 if TYPE_CHECKING:
-    from dcc_jax.config import Config
-    from dcc_jax.learn.rollout import Environment
-    from dcc_jax.training.loop import TrainResult
+    from dcc_jax.options import Options
+    from dcc_jax.training.loop import Run
 
 PROGRAM = "dcc_jax.train"
 
 
-def train(
-    config: Config,
-    *,
-    run_dir: Path | str | None = None,
-    resume: bool = False,
-    environment: Environment | None = None,
-    quiet: bool = False,
-) -> TrainResult:
-    """Trains a policy; `dcc_jax.training.loop.train` says what the arguments are."""
-    from dcc_jax.training import loop
-
-    return loop.train(
-        config, run_dir=run_dir, resume=resume, environment=environment, quiet=quiet
-    )
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
-    try:
-        if "jax" not in sys.modules:
-            runtime.setup()
-        from dcc_jax import options
-        from dcc_jax.training import loop
+    return command.run(PROGRAM, argv, _read, _prepare)
 
-        said = options.parse(sys.argv[1:] if argv is None else argv)
-        run = loop.prepare(said.config, said.run_dir, said.resume)
-    # OSError: a run directory that cannot be made, a clip that cannot be opened.
-    except (ValueError, OSError) as error:
-        return command.complain(PROGRAM, str(error), 2)
+
+def _read(arguments: list[str]) -> Options:
+    command.start_jax()
+    from dcc_jax import options
+
+    return options.parse(arguments)
+
+
+def _prepare(said: Options) -> command.Work:
+    from dcc_jax.training import loop
+
+    return partial(_train, loop.prepare(said.config, said.run_dir, said.resume))
+
+
+def _train(run: Run) -> None:
+    from dcc_jax.training import loop
+
     try:
         result = loop.execute(run)
         if result.metrics:
             curves.draw([result.run_dir], result.run_dir / "curves.png")
     except loop.RunError as error:
-        return command.complain(PROGRAM, str(error), 1)
+        raise command.WorkError(str(error)) from None
     except KeyboardInterrupt:
-        return command.complain(
-            PROGRAM, "interrupted twice; what was not saved is lost", 1
-        )
+        raise command.WorkError(
+            "interrupted twice; what was not saved is lost"
+        ) from None
     except Exception as error:
-        log = run.run_dir / "error.log"
-        with contextlib.suppress(OSError):
-            log.write_text(traceback.format_exc())
-        reason = (str(error).splitlines() or [""])[0][:200]
-        return command.complain(
-            PROGRAM, f"{type(error).__name__}: {reason} (details in {log})", 1
-        )
-    return 0
+        raise command.unforeseen(error, run.run_dir / "error.log") from None
 
 
 if __name__ == "__main__":

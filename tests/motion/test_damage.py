@@ -24,10 +24,7 @@ from dcc_jax.motion.retarget.importer import Options
 
 def run(capsys, *arguments: object) -> tuple[int, str, str]:
     """Status, stdout and stderr of the command."""
-    try:
-        status = main([str(argument) for argument in arguments])
-    except SystemExit as stop:
-        status = int(stop.code or 0)
+    status = main([str(argument) for argument in arguments])
     captured = capsys.readouterr()
     return status, captured.out, captured.err
 
@@ -40,7 +37,7 @@ def refused(capsys, folder: Path, name: str, data: str | bytes) -> str:
     status, _, err = run(capsys, "import", source, "--out", folder / "out.npz")
     assert status == 2, err
     assert sorted(folder.iterdir()) == before
-    assert err.startswith(str(source)) and err.count("\n") == 1
+    assert err.startswith(f"dcc_jax.motion.import: {source}:") and err.count("\n") == 1
     return err
 
 
@@ -133,7 +130,7 @@ def test_a_damaged_skeleton_is_refused(capsys, tmp_path, old, new, reason):
     skeleton.write_text(files.asf().replace(old, new, 1))
     status, _, err = run(capsys, "import", source, "--out", tmp_path / "out.npz")
     assert status == 2 and reason in err and err.count("\n") == 1
-    assert err.startswith(str(skeleton))
+    assert err.startswith(f"dcc_jax.motion.import: {skeleton}:")
     assert not (tmp_path / "out.npz").exists()
 
 
@@ -244,10 +241,16 @@ def test_several_sources_are_imported_and_the_bad_one_is_named(capsys, tmp_path)
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        (["--fps", "0"], "argument --fps"),
-        (["--unit", "furlong"], "argument --unit"),
-        (["--trim", "3:1"], "argument --trim"),
-        (["--up", "w"], "argument --up"),
+        (["--fps", "0"], "fps must be in [1, 1000] frames/s, got 0"),
+        (["--fps", "nan"], "fps must be in [1, 1000] frames/s, got nan"),
+        (["--source-fps", "fast"], "--source-fps: could not convert"),
+        (["--unit", "furlong"], "unit must be one of m, dm,"),
+        (["--trim", "3:1"], "A:B with A < B, got '3:1'"),
+        (["--trim", "3"], "A:B with A < B, got '3'"),
+        (["--trim", "nan:1"], "A:B with A < B, got 'nan:1'"),
+        (["--up", "w"], "up must be one of x, y, z, -x, -y, -z, got 'w'"),
+        (["--low-pass", "-1"], "low_pass must be 0 or a frequency in Hz, got -1"),
+        (["--format", "fbx"], "format must be one of auto, amc, bvh"),
         (["--map", "none.txt"], "none.txt: cannot be read"),
     ],
 )
@@ -264,9 +267,8 @@ def test_inspecting_what_is_no_clip_is_one_line(capsys, tmp_path):
     path = tmp_path / "no.npz"
     path.write_bytes(poselib())
     status, _, err = run(capsys, "inspect", path)
-    assert status == 2 and err == f"{path}: not a clip (its layout is not " + (
-        "'dcc_jax clip 1')\n"
-    )
+    reason = "not a clip (its layout is not 'dcc_jax clip 1')"
+    assert status == 2 and err == f"dcc_jax.motion.inspect: {path}: {reason}\n"
 
 
 REAL = [
@@ -364,3 +366,10 @@ def test_importers_need_no_jax():
         "import sys, dcc_jax.motion.retarget.importer; sys.exit('jax' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "span"), [("1:2.5", (1.0, 2.5)), (":2", (0.0, 2.0)), ("1:", (1.0, np.inf))]
+)
+def test_a_span_may_lack_one_of_its_ends(text, span):
+    assert importer.read_span(text) == span

@@ -1,54 +1,82 @@
-"""`python -m dcc_jax.evaluate RUN_DIR...`: the numbers of trained policies."""
+"""`dcc-jax evaluate RUN_DIR...`: the numbers of trained policies."""
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, arg
 
 from dcc_jax import command
+from dcc_jax.play import overrides
 
 if TYPE_CHECKING:
     from dcc_jax.evaluate.report import EvaluationPlan
 
 PROGRAM = "dcc_jax.evaluate"
-_DESCRIPTION = """Plays episodes of a trained policy's mean action and measures them.
-Every level of compliance meets the same initial states and perturbations. Exit status:
-0 done; 2 a bad argument; 1 a failure."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Plays episodes of a trained policy's mean action and measures them.
+
+    Every level of compliance meets the same initial states and perturbations.
+
+    Exit status: 0 done; 2 a bad argument; 1 a failure."""
+
+    run_dir: Annotated[
+        Positional[tuple[str, ...]],
+        arg(metavar="RUN_DIR [RUN_DIR ...]", help_behavior_hint="(required)"),
+    ]
+    """Run directories, or names of policies that ship."""
+
+    episodes: Annotated[int, arg(metavar="N")] = 256
+    """Episodes of each level of compliance."""
+
+    alpha: Annotated[
+        tuple[float, ...] | None,
+        arg(metavar="A [A ...]", help_behavior_hint="(default: as in training)"),
+    ] = None
+    """Levels of compliance; the first is the baseline."""
+
+    seconds: Annotated[
+        float | None, arg(metavar="S", help_behavior_hint="(default: as in training)")
+    ] = None
+    """Length of an episode."""
+
+    seed: Annotated[int, arg(metavar="N")] = 0
+    """Of everything that is drawn."""
+
+    task: overrides.TaskParameters = ()
+
+    json: Annotated[
+        Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")
+    ] = None
+    """Writes everything, raw rows included."""
+
+    figure: Annotated[
+        Path | None, arg(metavar="FILE.png", help_behavior_hint="(default: none)")
+    ] = None
+    """Writes a page of figures."""
+
+    def __post_init__(self) -> None:
+        if not self.run_dir:
+            raise ValueError("missing: RUN_DIR")
+        if self.alpha == ():
+            raise ValueError("--alpha needs a value")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
-    return command.run(_parser(), argv, _plan, _run)
+    return command.run(PROGRAM, argv, partial(overrides.read, PROGRAM, Options), _plan)
 
 
-def _parser() -> command.Parser:
-    parser = command.Parser(prog=f"python -m {PROGRAM}", description=_DESCRIPTION)
-    add = parser.add_argument
-    add(
-        "run_dir",
-        nargs="+",
-        metavar="RUN_DIR",
-        help="a run directory, or the name of a policy that ships",
-    )
-    add("--episodes", type=int, default=256, metavar="N", help="a level (256)")
-    add(
-        "--alpha",
-        type=float,
-        nargs="+",
-        metavar="A",
-        help="levels of compliance, the first is the baseline (those of the training)",
-    )
-    add("--seconds", type=float, metavar="S", help="of an episode (as in training)")
-    add("--seed", type=int, default=0, metavar="N", help="of all that is drawn (0)")
-    add("--json", type=Path, metavar="FILE", help="everything, raw rows included")
-    add("--figure", type=Path, metavar="FILE.png", help="a page of figures")
-    return parser
-
-
-def _plan(options: argparse.Namespace) -> EvaluationPlan:
+def _plan(options: Options) -> command.Work:
+    command.start_jax()
     from dcc_jax.evaluate import report, show
 
     if options.figure is not None:
@@ -56,18 +84,19 @@ def _plan(options: argparse.Namespace) -> EvaluationPlan:
     for path in (options.json, options.figure):
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
-    return report.prepare(
+    plan = report.prepare(
         options.run_dir,
         options.episodes,
         options.alpha,
         options.seed,
         options.seconds,
-        None,
+        overrides.changes(PROGRAM, options.run_dir[0], options.task),
         lambda text: print(text, file=sys.stderr),
     )
+    return partial(_measure, plan, options)
 
 
-def _run(plan: EvaluationPlan, options: argparse.Namespace) -> None:
+def _measure(plan: EvaluationPlan, options: Options) -> None:
     from rich.console import Console
     from rich.progress import Progress
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dcc_jax import runtime
 from dcc_jax.env.config import CONTROL_RATE
 from dcc_jax.env.task import Task
 from dcc_jax.evaluate import bootstrap, compare, measures
@@ -52,10 +53,10 @@ def evaluate(
     run_dir: str | Path | Sequence[str | Path],
     *,
     episodes: int = 256,
-    alpha: Sequence[float] | None = None,
+    alpha: float | Sequence[float] | None = None,
     seed: int = 0,
     seconds: float | None = None,
-    task: Task | None = None,
+    task: Mapping[str, Any] | Task | None = None,
     say: Callable[[str], None] = lambda _: None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Report:
@@ -67,10 +68,10 @@ def evaluate(
     Args:
         run_dir: a run directory, a policy that ships, or several of them.
         episodes: of each condition.
-        alpha: levels of compliance; None: the least and the greatest of the training.
+        alpha: levels of compliance, or one; None: the least and the greatest of the training.
         seed: of everything that is drawn.
         seconds: length of an episode; None: as in training.
-        task: in place of the configured one, e.g. with other parameters.
+        task: other parameters of the run's task, `{"width": 1.5}`, or another task.
         say: told what a reader of the numbers has to know.
         progress: told control steps done and to be done.
 
@@ -95,15 +96,18 @@ class EvaluationPlan:
 def prepare(
     run_dir: str | Path | Sequence[str | Path],
     episodes: int,
-    alpha: Sequence[float] | None,
+    alpha: float | Sequence[float] | None,
     seed: int,
     seconds: float | None,
-    task: Task | None,
+    task: Mapping[str, Any] | Task | None,
     say: Callable[[str], None],
 ) -> EvaluationPlan:
     """Checks everything a user can get wrong; arguments as of `evaluate`."""
+    runtime.ensure()
     names = [run_dir] if isinstance(run_dir, str | Path) else list(run_dir)
     runs = [find_run(name) for name in names]
+    if isinstance(alpha, float | int):
+        alpha = [alpha]
     _check(runs, episodes, alpha, seed, seconds)
     return EvaluationPlan(
         conditions=[(run, level) for run in runs for level in _levels(run, alpha, say)],
@@ -159,7 +163,7 @@ def _check(
         raise ValueError(f"seconds must be in [0.1, 3600], got {seconds}")
     if len({run.name for run in runs}) < len(runs):
         raise ValueError(f"a run is given twice: {', '.join(r.name for r in runs)}")
-    tasks = sorted({run.config.task for run in runs})
+    tasks = sorted({run.config.task.name for run in runs})
     if len(tasks) > 1:
         raise ValueError(f"the runs must be of one task, got {', '.join(tasks)}")
 
@@ -180,13 +184,16 @@ def _levels(
     return [float(level) for level in alpha]
 
 
-def _players(runs: list[Run], task: Task | None) -> dict[str, Player]:
+def _players(
+    runs: list[Run], task: Mapping[str, Any] | Task | None
+) -> dict[str, Player]:
     """By run. Runs whose environments differ in alpha alone share a program."""
     shared: dict[str, Player] = {}
     players = {}
     for run in runs:
         environment = make_environment(run, task)
-        same = repr(asdict(run.config.env) | {"alpha": None, "alpha_max": None})
+        env = asdict(run.config.env) | {"alpha": None, "alpha_max": None}
+        same = repr((environment.task, env))
         players[run.name] = shared.setdefault(same, Player(environment))
     return players
 

@@ -113,9 +113,9 @@ def make_update(
     return jax.jit(sharded, donate_argnums=0)
 
 
-def state_shardings(mesh: Mesh, state: TrainState) -> TrainState:
+def state_shardings(mesh: Mesh, state: TrainState, runs: bool = False) -> TrainState:
     """The sharding of every leaf, for putting a restored state on the devices."""
-    specs = _state_specs(runs=False)
+    specs = _state_specs(runs)
     return jax.tree.map(
         lambda spec, part: jax.tree.map(lambda _: NamedSharding(mesh, spec), part),
         specs,

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from dcc_jax import config, tasks
 from dcc_jax.character import asset_path
@@ -12,7 +14,7 @@ from dcc_jax.config import Config
 from dcc_jax.env.environment import Environment
 from dcc_jax.env.task import Task
 from dcc_jax.learn.rollout import Policy
-from dcc_jax.training import checkpoint
+from dcc_jax.training import checkpoint, folder
 
 _FOREVER = 1e6  # s
 
@@ -36,11 +38,14 @@ def find_run(name: str | Path) -> Run:
     """The policy in a run directory, or one of those that ship, by path or name.
 
     Raises:
-        ValueError: there is none, or it is damaged.
+        ValueError: there is none, or it is damaged, or there are the many of a sweep.
     """
     path = Path(name)
     if not path.exists():
         path = _shipped(str(name))
+    if (path / folder.SWEEP).exists():
+        within = ", ".join(sorted(p.parent.name for p in path.glob("*/policy.npz")))
+        raise ValueError(f"{name} is a sweep; its runs are {within or 'not begun'}")
     return Run(str(name), config.load(path), checkpoint.load_policy(path))
 
 
@@ -60,20 +65,25 @@ def _shipped(name: str) -> Path:
     raise ValueError(f"{name} is not a run directory{ships}")
 
 
-def make_environment(run: Run, task: Task | None = None) -> Environment:
+def make_environment(
+    run: Run, task: Mapping[str, Any] | Task | None = None
+) -> Environment:
     """The environment of a run, without an end: episodes are as long as one likes.
 
     A clip that the task follows in time is played from its start, not from anywhere.
 
     Args:
         run: whose configuration counts.
-        task: in place of the configured one, e.g. a door of another width.
+        task: other parameters of the run's task, `{"width": 1.5}`, or a task in its
+            place; None: as it was trained.
 
     Raises:
-        ValueError: an unknown task, clips that are missing or damaged, or another
+        ValueError: unknown parameters, clips that are missing or damaged, or another
             observation or action than the policy's.
     """
-    task = tasks.make_task(run.config.task) if task is None else task
+    if not isinstance(task, Task):
+        changes = {f"task.{name}": value for name, value in (task or {}).items()}
+        task = run.config.with_(changes).task
     env = dataclasses.replace(
         run.config.env,
         episode_seconds=_FOREVER,

@@ -1,56 +1,80 @@
-"""`python -m dcc_jax.render RUN_DIR`: a video of a trained policy."""
+"""`dcc-jax render RUN_DIR`: a video of a trained policy."""
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import Positional, arg
 
 from dcc_jax import command
+from dcc_jax.play import overrides
 
 if TYPE_CHECKING:
     from dcc_jax.render.film import FilmPlan
 
 PROGRAM = "dcc_jax.render"
-_DESCRIPTION = """Films a trained policy's mean action. Arrows are the forces that the
-compliance hears, the ghost shows the displacement u. Exit status: 0 done; 2 a bad
-argument; 1 a failure."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Films a trained policy's mean action.
+
+    Arrows are the forces passed to the compliance controller; the ghost is the pose
+    without the displacement u.
+
+    Exit status: 0 done; 2 a bad argument; 1 a failure."""
+
+    run_dir: Annotated[Positional[str], arg(metavar="RUN_DIR")]
+    """A run directory, or the name of a policy that ships."""
+
+    out: Annotated[
+        Path | None,
+        arg(
+            metavar="FILE.mp4",
+            help_behavior_hint="(default: RUN_DIR.mp4, without --strip)",
+        ),
+    ] = None
+    """The video."""
+
+    seconds: Annotated[float, arg(metavar="S")] = 8.0
+    """Length of the video."""
+
+    alpha: Annotated[
+        float | None,
+        arg(metavar="A", help_behavior_hint="(default: the greatest of the training)"),
+    ] = None
+    """Level of compliance."""
+
+    seed: Annotated[int, arg(metavar="N")] = 0
+    """Of everything that is drawn."""
+
+    task: overrides.TaskParameters = ()
+
+    strip: Annotated[
+        Path | None, arg(metavar="FILE.png", help_behavior_hint="(default: none)")
+    ] = None
+    """Frames side by side on one page."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
-    return command.run(_parser(), argv, _plan, _run)
+    return command.run(PROGRAM, argv, partial(overrides.read, PROGRAM, Options), _plan)
 
 
-def _parser() -> command.Parser:
-    parser = command.Parser(prog=f"python -m {PROGRAM}", description=_DESCRIPTION)
-    add = parser.add_argument
-    add(
-        "run_dir",
-        metavar="RUN_DIR",
-        help="a run directory, or the name of a policy that ships",
-    )
-    add(
-        "--out",
-        type=Path,
-        metavar="FILE.mp4",
-        help="the video; without it and --strip, <name of the run>.mp4",
-    )
-    add("--seconds", type=float, default=8.0, metavar="S", help="of the video (8)")
-    add("--alpha", type=float, metavar="A", help="compliance (the training's greatest)")
-    add("--seed", type=int, default=0, metavar="N", help="of all that is drawn (0)")
-    add("--strip", type=Path, metavar="FILE.png", help="frames on one page")
-    return parser
-
-
-def _plan(options: argparse.Namespace) -> FilmPlan:
+def _plan(options: Options) -> command.Work:
+    command.start_jax()
     from dcc_jax.render import film
 
-    return film.prepare(**vars(options), task=None)
+    task = overrides.changes(PROGRAM, options.run_dir, options.task)
+    arguments: dict[str, Any] = {**vars(options), "task": task}
+    return partial(_film, film.prepare(**arguments))
 
 
-def _run(plan: FilmPlan, _: argparse.Namespace) -> None:
+def _film(plan: FilmPlan) -> None:
     from rich.console import Console
     from rich.progress import track
 

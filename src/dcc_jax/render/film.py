@@ -6,14 +6,16 @@ Letters: T frames, one a control step.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 from matplotlib.image import imsave
 
+from dcc_jax import runtime
 from dcc_jax.env.config import CONTROL_RATE
 from dcc_jax.env.task import Task
 from dcc_jax.play.player import Player
@@ -58,7 +60,7 @@ def render(
     alpha: float | None = None,
     seed: int = 0,
     strip: str | Path | None = None,
-    task: Task | None = None,
+    task: Mapping[str, Any] | Task | None = None,
 ) -> None:
     """Films the mean action of a policy.
 
@@ -69,7 +71,7 @@ def render(
         alpha: level of compliance; None: the greatest of the training.
         seed: of everything that is drawn.
         strip: a picture of frames side by side.
-        task: in place of the configured one, e.g. with other parameters.
+        task: other parameters of the run's task, `{"width": 1.5}`, or another task.
 
     Raises:
         ValueError: naming the argument, its value and what is allowed.
@@ -86,7 +88,7 @@ def prepare(
     alpha: float | None,
     seed: int,
     strip: str | Path | None,
-    task: Task | None,
+    task: Mapping[str, Any] | Task | None,
 ) -> FilmPlan:
     """Checks everything a user can get wrong; arguments as of `render`."""
     if not 0.1 <= seconds <= 3600.0:
@@ -95,6 +97,7 @@ def prepare(
         raise ValueError(f"alpha must be in [0, 1], got {alpha}")
     if not 0 <= seed < 2**32:
         raise ValueError(f"seed must be between 0 and 2^32 - 1, got {seed}")
+    runtime.ensure()
     run = find_run(run_dir)
     if out is None and strip is None:
         out = f"{Path(run.name).resolve().name}.mp4"
@@ -239,7 +242,7 @@ def _captions(
 ) -> list[str]:
     numbers = {name: x[times, episodes] for name, x in recording.numbers.items()}
     alive = recording.alive[times, episodes]
-    head = f"{plan.run.config.task}  alpha {plan.alpha:g}"
+    head = f"{plan.player.environment.task.name}  alpha {plan.alpha:g}"
     return [
         f"{head}  {(time + 1) / CONTROL_RATE:.2f} s"
         f"  force {numbers['force_peak'][i]:.0f} N"

@@ -4,45 +4,29 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from dcc_jax import runtime
 from dcc_jax.character import asset_path, load_character
 from dcc_jax.env.config import EnvConfig
 from dcc_jax.env.environment import Environment
 from dcc_jax.env.task import Task
 from dcc_jax.motion.clip import Clip, load_clip
 from dcc_jax.motion.reference import make_references
-from dcc_jax.tasks.backflip import Backflip
-from dcc_jax.tasks.ball import Ball
-from dcc_jax.tasks.chicken_fight import ChickenFight
-from dcc_jax.tasks.door import Door
-from dcc_jax.tasks.hand_in_hand import HandInHand
-from dcc_jax.tasks.push import Push
-from dcc_jax.tasks.sustained_push import SustainedPush
-from dcc_jax.tasks.trampoline import Trampoline
+from dcc_jax.tasks.registry import (
+    TASKS,
+    find_task,
+    make_task,
+    register_task,
+    task_name,
+)
 
-TASKS: dict[str, type[Task]] = {
-    task.name: task
-    for task in (
-        Push,
-        SustainedPush,
-        Trampoline,
-        Backflip,
-        HandInHand,
-        ChickenFight,
-        Door,
-        Ball,
-    )
-}
-
-
-def make_task(name: str) -> Task:
-    """The task called `name`, with its defaults.
-
-    Raises:
-        ValueError: there is none; the message lists them.
-    """
-    if name not in TASKS:
-        raise ValueError(f"task must be one of {', '.join(TASKS)}, got {name!r}")
-    return TASKS[name]()
+__all__ = [
+    "TASKS",
+    "find_task",
+    "make_environment",
+    "make_task",
+    "register_task",
+    "task_name",
+]
 
 
 def make_environment(task: Task, config: EnvConfig) -> Environment:
@@ -52,6 +36,7 @@ def make_environment(task: Task, config: EnvConfig) -> Environment:
         ValueError: clips that are missing or do not suit the task.
         MotionError: a clip that cannot be read.
     """
+    runtime.ensure()
     try:
         references = make_references(_clips(task, config))
     except FileNotFoundError as error:

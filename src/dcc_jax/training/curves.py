@@ -1,10 +1,14 @@
-"""`python -m dcc_jax.curves RUN_DIR...`: how training went, as one picture."""
+"""`dcc-jax curves RUN_DIR...`: how training went, as one picture."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
 
 from dcc_jax import command
 from dcc_jax.training import logs
@@ -77,20 +81,39 @@ def _metrics(run_dir: Path) -> list[dict[str, float]]:
     return rows
 
 
+@dataclass(frozen=True)
+class Options:
+    """Draws how training went: reward, falls, style, speed and more over tuples.
+
+    Exit status: 0 done; 2 a bad argument; 1 a failure."""
+
+    run_dir: Annotated[
+        Positional[tuple[Path, ...]],
+        arg(metavar="RUN_DIR [RUN_DIR ...]", help_behavior_hint="(required)"),
+    ]
+    """Directories of training runs; several are drawn over each other."""
+
+    out: Annotated[
+        Path | None,
+        arg(metavar="FILE.png", help_behavior_hint="(default: RUN_DIR/curves.png)"),
+    ] = None
+    """The picture."""
+
+    def __post_init__(self) -> None:
+        if not self.run_dir:
+            raise ValueError("missing: RUN_DIR")
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
-    parser = command.Parser(prog=PROGRAM, description=__doc__)
-    parser.add_argument("run_dir", type=Path, nargs="+", help="of training runs")
-    parser.add_argument("--out", type=Path, help="default RUN_DIR/curves.png")
-    try:
-        options = parser.parse_args(argv)
-        out = options.out or options.run_dir[0] / "curves.png"
-        draw(options.run_dir, out)
-    except (ValueError, OSError) as error:
-        return command.complain(PROGRAM, str(error), 2)
-    print(out)
-    return 0
+    return command.run(PROGRAM, argv, partial(command.parse, PROGRAM, Options), _draw)
+
+
+def _draw(options: Options) -> command.Work:
+    out = options.out or options.run_dir[0] / "curves.png"
+    draw(options.run_dir, out)
+    return lambda: print(out)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command.leave(main())

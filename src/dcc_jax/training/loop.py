@@ -2,33 +2,26 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import FrameType, TracebackType
-from typing import Any
 
 import jax
 import numpy as np
 
-from dcc_jax import config, tasks
+from dcc_jax import runtime, tasks
 from dcc_jax.config import Config
 from dcc_jax.learn import learner, style
 from dcc_jax.learn.rollout import Environment, Policy
 from dcc_jax.learn.state import TrainState, UpdateReport
-from dcc_jax.training import checkpoint, logs
+from dcc_jax.training import checkpoint, folder, logs
+from dcc_jax.training.folder import RunError, default_run_dir
+from dcc_jax.training.stop import StopSignal
 
-_MAY_CHANGE = ("train.total_tuples", "train.checkpoint_interval")
 _MAX_DUMPS = 20
-
-
-class RunError(RuntimeError):
-    """A run that began and could not go on."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +66,7 @@ def train(
         ValueError: something about the arguments is wrong; nothing was written.
         RunError: the run failed; its checkpoints are intact.
     """
+    runtime.ensure(quiet=quiet)
     prepared = prepare(config, run_dir, resume, environment)
     return execute(prepared, quiet=quiet)
 
@@ -91,39 +85,16 @@ def prepare(
     if run_dir is None:
         if resume:
             raise ValueError("resume needs run_dir: the run to continue")
-        run_dir = default_run_dir(wanted.task)
+        run_dir = default_run_dir(wanted.task.name)
     run_dir = Path(run_dir)
-    if resume:
-        _check_resumable(config.load(run_dir), wanted, run_dir)
-    elif run_dir.exists() and (not run_dir.is_dir() or any(run_dir.iterdir())):
-        raise ValueError(
-            f"run_dir {run_dir} exists and is not empty; resume continues a run"
-        )
+    folder.check(run_dir, wanted, resume)
+    runtime.ensure()
     if environment is None:
         environment = make_environment(wanted)
     mesh = learner.make_mesh(wanted.train)
     learner.check_sizes(wanted, mesh.size)
-    _begin(run_dir, wanted)
+    folder.begin(run_dir, wanted)
     return Run(wanted, run_dir, environment, mesh, resume)
-
-
-def _begin(run_dir: Path, wanted: Config) -> None:
-    """Makes the run directory with its configuration."""
-    try:
-        run_dir.mkdir(parents=True, exist_ok=True)
-        checkpoint.write_atomically(
-            run_dir / "config.json", config.to_json(wanted).encode()
-        )
-    except OSError as error:
-        raise ValueError(
-            f"run_dir {run_dir} cannot be written ({error.strerror}); "
-            "--run-dir DIR names another place"
-        ) from None
-
-
-def default_run_dir(task: str) -> Path:
-    """`runs/<task>-<date>-<time>` in the working directory."""
-    return Path("runs") / f"{task}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
 def execute(run: Run, *, quiet: bool = False) -> TrainResult:
@@ -134,7 +105,7 @@ def execute(run: Run, *, quiet: bool = False) -> TrainResult:
     """
     with (
         logs.Progress(run.config.train.total_tuples, quiet) as progress,
-        _StopSignal() as stop,
+        StopSignal() as stop,
     ):
         try:
             return _loop(run, progress, stop)
@@ -142,7 +113,7 @@ def execute(run: Run, *, quiet: bool = False) -> TrainResult:
             raise RunError(f"{error}") from error
 
 
-def _loop(run: Run, progress: logs.Progress, stop: _StopSignal) -> TrainResult:
+def _loop(run: Run, progress: logs.Progress, stop: StopSignal) -> TrainResult:
     train = run.config.train
     state, update = _prepared(run, progress.say)
     measure_style = jax.jit(partial(style.of_running, run.environment))
@@ -242,7 +213,7 @@ def _finish(
     run: Run,
     done: int,
     state: TrainState,
-    stop: _StopSignal,
+    stop: StopSignal,
     say: Callable[[str], None],
 ) -> TrainResult:
     if stop.name:
@@ -280,44 +251,6 @@ def make_environment(wanted: Config) -> Environment:
     """The environment of a configuration's task.
 
     Raises:
-        ValueError: an unknown task, or clips that are missing or damaged.
+        ValueError: clips that are missing or damaged.
     """
-    return tasks.make_environment(tasks.make_task(wanted.task), wanted.env)
-
-
-def _check_resumable(old: Config, new: Config, run_dir: Path) -> None:
-    for name, before, after in config.differences(old, new):
-        if name not in _MAY_CHANGE:
-            raise ValueError(
-                f"{name} is {before} in {run_dir} and cannot become {after}; only "
-                f"{' and '.join(_MAY_CHANGE)} may change when a run is resumed"
-            )
-
-
-class _StopSignal:
-    """Notes SIGTERM and Ctrl-C; a second one interrupts at once."""
-
-    def __init__(self) -> None:
-        self.name = ""
-        self._previous: dict[int, Any] = {}
-
-    def __enter__(self) -> _StopSignal:
-        # Elsewhere than in the main thread Python gives no say over signals.
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGTERM, signal.SIGINT):
-                self._previous[number] = signal.signal(number, self._note)
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        if self.name:
-            raise KeyboardInterrupt
-        self.name = signal.Signals(number).name
+    return tasks.make_environment(wanted.task, wanted.env)

@@ -22,6 +22,8 @@ from dcc_jax.motion.formats.deepmimic import is_deepmimic, read_deepmimic
 from dcc_jax.motion.formats.npz import MotionError
 from dcc_jax.motion.formats.poselib import is_poselib, read_poselib
 from dcc_jax.motion.formats.skeleton import (
+    AXES,
+    UNITS,
     Motion,
     in_metres,
     in_our_axes,
@@ -51,6 +53,43 @@ class Options:
     loop: bool = False
     low_pass: float = LOW_PASS  # Hz; 0 keeps everything
     clean: bool = True
+
+    def __post_init__(self) -> None:
+        _check_choice("format", self.format, ("auto", *FORMATS))
+        _check_choice("unit", self.unit, (None, *UNITS))
+        _check_choice("up", self.up, (None, *AXES))
+        for name in ("fps", "source_fps"):
+            rate = getattr(self, name)
+            if rate is not None and not 1.0 <= rate <= 1000.0:
+                raise ValueError(f"{name} must be in [1, 1000] frames/s, got {rate:g}")
+        if self.trim is not None and not 0.0 <= self.trim[0] < self.trim[1]:
+            raise ValueError(f"trim must be two times, A before B, got {self.trim}")
+        if not 0.0 <= self.low_pass < math.inf:
+            raise ValueError(
+                f"low_pass must be 0 or a frequency in Hz, got {self.low_pass:g}"
+            )
+
+
+def _check_choice(name: str, value: str | None, known: Sequence[str | None]) -> None:
+    if value not in known:
+        names = ", ".join(one for one in known if one is not None)
+        raise ValueError(f"{name} must be one of {names}, got {value!r}")
+
+
+def read_span(text: str) -> tuple[float, float]:
+    """Two times, s, of `A:B`; without A from the start, without B to the end.
+
+    Raises:
+        ValueError: it is no such text.
+    """
+    start, colon, stop = text.partition(":")
+    try:
+        span = float(start or 0.0), float(stop or "inf")
+    except ValueError:
+        span = 0.0, 0.0
+    if not colon or not 0.0 <= span[0] < span[1]:
+        raise ValueError(f"trim must be two times A:B with A < B, got {text!r}")
+    return span
 
 
 def detect_format(path: Path) -> str:
