@@ -15,7 +15,7 @@ import dataclasses
 from dcc_jax import runtime
 from dcc_jax.training import loop
 
-runtime.setup()
+runtime.ensure()
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402

@@ -26,7 +26,7 @@ from functools import partial
 from dcc_jax import runtime
 
 # Compile times are measured: cold means an empty cache.
-runtime.setup(cache_dir=tempfile.mkdtemp())
+runtime.ensure(cache_dir=tempfile.mkdtemp())
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402

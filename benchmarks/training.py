@@ -30,7 +30,7 @@ from typing import Any
 from dcc_jax import runtime
 from dcc_jax.training import loop
 
-runtime.setup()
+runtime.ensure()
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
@@ -180,7 +180,7 @@ def first_update(config: Config, cache: str) -> float:
     """Seconds from the command to the first line of metrics, in a fresh process."""
     with tempfile.TemporaryDirectory() as folder:
         run_dir = Path(folder) / "run"
-        command = [sys.executable, "-m", "dcc_jax.train", "--task", config.task]
+        command = [sys.executable, "-m", "dcc_jax.train", "--task", config.task.name]
         command += ["--preset", config.preset, "--run-dir", str(run_dir)]
         environ = os.environ | {"DCC_JAX_CACHE": cache}
         begin = time.perf_counter()

@@ -239,7 +239,7 @@ def main() -> None:
     add("--out", type=Path, default=Path("runs/chicken_match.png"), metavar="FILE.png")
     add("--video", type=Path, metavar="FILE.mp4", help="the first match, last level")
     options = parser.parse_args()
-    runtime.setup()
+    runtime.ensure()
     from dcc_jax.play.runs import find_run, make_environment
     from dcc_jax.tasks.match import Match
     from dcc_jax.viz import draw as pictures

@@ -18,7 +18,7 @@ from __future__ import annotations
 from dcc_jax import runtime
 
 if __name__ == "__main__":
-    runtime.setup()
+    runtime.ensure()
 
 import argparse
 import dataclasses

@@ -80,7 +80,7 @@ def draw(points: list[dict], out: Path) -> None:
 
 def main() -> None:
     options = paired.parser(__doc__, "fig4_levels", LEVELS)
-    runtime.setup()
+    runtime.ensure()
     report = paired.evaluated(options, "push", Path("runs/fig4_levels"))
     points = measured(report.rows, options.alpha)
     paired.write(options.out, report.rows, points)

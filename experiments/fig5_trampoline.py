@@ -103,7 +103,7 @@ def draw(points: list[dict], out: Path) -> None:
 
 def main() -> None:
     options = paired.parser(__doc__, "fig5_trampoline", LEVELS)
-    runtime.setup()
+    runtime.ensure()
     report = paired.evaluated(options, "trampoline", Path("runs/fig5_trampoline"))
     points = measured(report, options.alpha)
     paired.write(options.out, report.rows, points)

@@ -150,7 +150,7 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path, default=Path("runs/fig6_door.png"))
     options = parser.parse_args()
-    runtime.setup()
+    runtime.ensure()
     runs = options.runs or [train(options.preset)]
     rows = measure(runs, options)
     points = curves(rows)

@@ -27,7 +27,7 @@ import numpy as np
 from dcc_jax import runtime
 from dcc_jax.training import loop
 
-runtime.setup()
+runtime.ensure()
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402

@@ -68,7 +68,8 @@ def evaluate(
     Args:
         run_dir: a run directory, a policy that ships, or several of them.
         episodes: of each condition.
-        alpha: levels of compliance, or one; None: the least and the greatest of the training.
+        alpha: levels of compliance, or one; None: the least and the greatest of the
+            training.
         seed: of everything that is drawn.
         seconds: length of an episode; None: as in training.
         task: other parameters of the run's task, `{"width": 1.5}`, or another task.
