@@ -62,9 +62,19 @@ def test_a_standing_character_goes_on(start, step):
     np.testing.assert_array_equal(after.previous_features, start.features)
 
 
-def test_a_pelvis_near_the_ground_has_fallen(environment, start, step):
-    low = environment.fallen.pelvis - 0.05
-    assert step(moved(start, z=low)).terminated
+def test_who_lies_has_fallen(start, step):
+    """On the back, soles in the air: nothing throws it up again."""
+    lying = jnp.array([np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0])
+    qpos = start.body.qpos.at[2].set(0.3).at[3:7].set(lying)
+    body = dataclasses.replace(start.body, qpos=qpos)
+    assert step(dataclasses.replace(start, body=body)).terminated
+
+
+def test_a_pelvis_that_is_lower_than_in_any_clip_has_fallen(environment):
+    q = jnp.asarray(environment.scene.model.qpos0[:55], jnp.float32)
+    threshold, ground = environment.fallen.pelvis, jnp.zeros(())
+    fallen = environment.fallen
+    assert fallen(environment.kinematics, q.at[2].set(threshold - 0.01), ground)
 
 
 def test_a_hand_on_the_ground_is_a_fall_though_the_pelvis_is_high(environment):

@@ -24,7 +24,8 @@ PROGRAM = "dcc_jax.evaluate"
 class Options:
     """Plays episodes of a trained policy's mean action and measures them.
 
-    Every level of compliance meets the same initial states and perturbations.
+    Every level of compliance meets the same initial states and perturbations. Where
+    levels are compared, a control arm tells the policy alpha and displaces nothing.
 
     Exit status: 0 done; 2 a bad argument; 1 a failure."""
 
@@ -42,6 +43,9 @@ class Options:
         arg(metavar="A [A ...]", help_behavior_hint="(default: as in training)"),
     ] = None
     """Levels of compliance; the first is the baseline."""
+
+    control: bool = True
+    """Play each level above 0 also with u off."""
 
     seconds: Annotated[
         float | None, arg(metavar="S", help_behavior_hint="(default: as in training)")
@@ -92,6 +96,7 @@ def _plan(options: Options) -> command.Work:
         options.seconds,
         overrides.changes(PROGRAM, options.run_dir[0], options.task),
         lambda text: print(text, file=sys.stderr),
+        options.control,
     )
     return partial(_measure, plan, options)
 
