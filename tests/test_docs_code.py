@@ -81,9 +81,8 @@ def stood_in(monkeypatch: pytest.MonkeyPatch) -> None:
     """In place of everything that takes minutes."""
     one = Interval(0.5, 0.4, 0.6)
     row: dict[str, Any] = dict.fromkeys([*measures.METRICS, FINAL_ANGLE], 0.5)
-    empty: dict[str, Any] = {name: [] for name in inspect.signature(Report).parameters}
     report = Report(
-        **empty
+        **emptied(Report)
         | {
             "conditions": [Condition("run", 0.0)],
             "summary": [dict.fromkeys(measures.METRICS, one)],
@@ -98,12 +97,17 @@ def stood_in(monkeypatch: pytest.MonkeyPatch) -> None:
             finished=True,
         ),
         "evaluate": report,
-        "sweep": SweepResult(rows=[row], policies={}),
+        "sweep": SweepResult(**emptied(SweepResult) | {"rows": [row]}),
         "render": None,
     }
     for name, result in results.items():
         real = getattr(dcc_jax, name)
         monkeypatch.setattr(dcc_jax, name, checked(real, result))
+
+
+def emptied(kind: type) -> dict[str, Any]:
+    """No value for each field of a result, whatever fields it has."""
+    return {name: [] for name in inspect.signature(kind).parameters}
 
 
 def checked(real: Callable[..., Any], result: Any) -> Callable[..., Any]:
