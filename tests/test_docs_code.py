@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from dcc_jax.__main__ import main
 
 import dcc_jax
+from dcc_jax.__main__ import main
 from dcc_jax.character import asset_path
 from dcc_jax.config import Config, make_config, to_json
 from dcc_jax.evaluate import measures
