@@ -1,6 +1,6 @@
-"""Stable PD control (Eq. 2, Tan et al. 2011).
+"""Stable PD control (Eq. (2), Tan et al. 2011).
 
-Stable PD evaluates Eq. 2 at the end of the step:
+Stable PD evaluates Eq. (2) at the end of the step:
 
     (M + h Kv) qdd = Kp (q_bar - q - h qd) - Kv qd + rest.
 
@@ -21,7 +21,7 @@ Array = jax.Array
 
 
 def torque(character: Character, q: Array, qd: Array, q_bar: Array, h: float) -> Array:
-    """Explicit part of the stable PD torques [42], N m, zero on the root.
+    """Explicit part of the stable PD torques [42], N m, zero on the root, Eq. (2).
 
     Departure: the torque limit (the paper states none) clips this explicit part.
 

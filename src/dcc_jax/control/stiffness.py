@@ -1,6 +1,7 @@
 """The work-space stiffness of a PD-controlled mechanism (Sec. 3.2, Fig. 2).
 
-Plain functions on any `mujoco.MjModel`, outside jit, in double precision.
+K = -df/dx, Eq. (3): the force f with which a mechanism answers when a point of it is
+moved by x. Plain functions on any `mujoco.MjModel`, outside jit, in double precision.
 """
 
 from __future__ import annotations
@@ -73,6 +74,9 @@ def stiffness(
 def modulated_stiffness(K: np.ndarray, alpha: float) -> np.ndarray:
     """K_hat = (1 - alpha) K, Eq. (7): what the compliance controller leaves of K.
 
+    Eq. (5) is the stiffness where the target q_bar moves along,
+    kp (L - J^-T dq_bar/dx), and Eq. (6) the choice dq_bar/dx = alpha J^T L.
+
     It is reached by the controller whose velocity is measured; see
     `dcc_jax.control.compliance` for the conditions.
 
@@ -119,6 +123,8 @@ def deflection(
     K: np.ndarray, force: np.ndarray | Sequence[float], alpha: float = 0.0
 ) -> np.ndarray:
     """Where a small constant force takes the point at last, x = K_hat^-1 f, m [3].
+
+    Eq. (3) the other way round, with the K_hat of Eq. (7).
 
     Args:
         K: stiffness [3, 3], N/m.

@@ -111,6 +111,9 @@ def kinematics(scene: Scene, state: State, world: World | None = None) -> Kinema
 def solve(scene: Scene, kin: Kinematics, state: State, qfrc: Array) -> Solution:
     """Accelerations under applied generalized forces, contacts and equalities.
 
+    M(q) qdd + c(q, qd) = tau + tau_ext, Eq. (1), with the contacts' share of tau_ext
+    found along with qdd.
+
     Args:
         scene: the scene.
         kin: of the same state.

@@ -1,0 +1,44 @@
+"""Writes `docs/skills.png`: one moment of each skill, cut from the strips in results.
+
+`python -m tools.skills_picture` after new strips have been rendered.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.image import imread, imsave
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+ACROSS, DOWN = 4, 3  # pictures of a strip
+MOMENTS = {
+    "push": (2, 1),
+    "trampoline": (0, 3),
+    "backflip": (0, 3),
+    "door": (1, 1),
+    "hand-in-hand": (2, 2),
+    "ball": (2, 3),
+    "chicken-fight": (1, 3),
+    "sustained-push": (2, 2),
+}
+"""Row and column in the strip of each skill, chosen by eye."""
+
+
+def moment(skill: str) -> np.ndarray:
+    """The chosen picture [H, W, 3] of a skill's strip."""
+    strip = imread(DOCS / "results" / f"{skill}.png")[..., :3]
+    height, width = strip.shape[0] // DOWN, strip.shape[1] // ACROSS
+    row, column = MOMENTS[skill]
+    return strip[row * height : (row + 1) * height, column * width :][:, :width]
+
+
+def main() -> None:
+    """Two rows of four."""
+    pictures = [moment(skill) for skill in MOMENTS]
+    rows = [np.concatenate(pictures[i : i + 4], axis=1) for i in (0, 4)]
+    imsave(DOCS / "skills.png", np.concatenate(rows))
+
+
+if __name__ == "__main__":
+    main()
