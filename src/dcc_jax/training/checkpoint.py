@@ -1,9 +1,9 @@
 """Whole runs on disk, and policies small enough to ship. No pickle is ever loaded.
 
 A checkpoint is `checkpoints/000000050/`, which orbax's `CheckpointManager` writes
-elsewhere and renames into place when it is whole. It has two items: `state`, every array
-by its name, and `digests`, a SHA-256 of every array. What orbax reads is compared with
-them, so that a damaged checkpoint is never resumed from.
+elsewhere and renames into place when it is whole. It has two items: `state`, every
+array by its name, and `digests`, a SHA-256 of every array. What orbax reads is compared
+with them, so that a damaged checkpoint is never resumed from.
 """
 
 from __future__ import annotations
