@@ -69,13 +69,45 @@ def test_no_checkpoint_is_no_error(tmp_path):
 
 
 def test_flipped_byte_is_named_and_the_one_before_is_used(run_dir):
-    damaged = _flip_a_byte(run_dir / "checkpoints" / "000000004")
+    _flip_a_byte(run_dir / "checkpoints" / "000000004")
     said: list[str] = []
     found = checkpoint.restore_latest(run_dir, _state(0), said.append)
     assert found is not None and found[0] == 2
     assert _equal(found[1], _state(2))
     assert len(said) == 1
-    assert "000000004" in said[0] and damaged.name in said[0]
+    assert "skipping damaged checkpoint" in said[0] and "000000004" in said[0]
+
+
+def test_array_that_is_not_what_was_written_is_named(run_dir, monkeypatch):
+    # Damage that the storage library does not notice.
+    digests = checkpoint._digests
+
+    def of_another_key(arrays):
+        return digests(arrays | {"key": arrays["key"] + 1})
+
+    monkeypatch.setattr(checkpoint, "_digests", of_another_key)
+    checkpoint.save(run_dir, 6, _state(6), keep=3)
+    monkeypatch.undo()
+    said: list[str] = []
+    found = checkpoint.restore_latest(run_dir, _state(0), said.append)
+    assert found is not None and found[0] == 4
+    assert len(said) == 1 and "000000006: key is not what was written" in said[0]
+
+
+def test_checkpoint_of_an_older_version_is_refused_in_one_line(run_dir):
+    (run_dir / "checkpoints" / "000000004.sha256").write_text("{}")
+    with pytest.raises(ValueError, match=r"000000004 was written by an older version"):
+        checkpoint.restore_latest(run_dir, _state(0), _silent)
+
+
+def test_update_is_saved_although_a_later_one_is_damaged(run_dir):
+    _flip_a_byte(run_dir / "checkpoints" / "000000004")
+    checkpoint.save(run_dir, 3, _state(3), keep=3)
+    said: list[str] = []
+    found = checkpoint.restore_latest(run_dir, _state(0), said.append)
+    assert found is not None and found[0] == 3 and len(said) == 1
+    checkpoint.save(run_dir, 4, _state(4), keep=3)
+    assert checkpoint.restore_latest(run_dir, _state(0), _silent)[0] == 4
 
 
 def test_missing_file_is_damage_too(run_dir):
@@ -94,7 +126,9 @@ def test_all_damaged_is_an_error(run_dir):
 
 
 def test_write_that_a_kill_cut_short_does_not_count(run_dir):
-    (run_dir / "checkpoints" / "000000004.sha256").unlink()
+    # What orbax calls a directory until it is whole.
+    folder = run_dir / "checkpoints"
+    folder.joinpath("000000004").rename(folder / "000000004.orbax-checkpoint-tmp")
     found = checkpoint.restore_latest(run_dir, _state(0), _silent)
     assert found is not None and found[0] == 2
     checkpoint.save(run_dir, 4, _state(4), keep=3)

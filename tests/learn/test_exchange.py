@@ -7,7 +7,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 from jax.sharding import NamedSharding, PartitionSpec
 
 from dcc_jax import config
-from dcc_jax.learn import learner
+from dcc_jax.learn import discriminator, learner, networks, ppo
 from dcc_jax.learn.exchange import all_gather_tree
 from dcc_jax.training import loop
 
@@ -102,3 +102,46 @@ def test_gathered_keeps_structure_and_types_and_the_order_of_devices():
     for index, x_all in zip(of_all["index"], of_all["x"], strict=True):
         assert list(index) == list(range(devices))
         assert jnp.array_equal(x_all.reshape(-1), x)
+
+
+def _crossing(jaxpr: Jaxpr) -> int:
+    """Arrays that a program sends across devices, those of its loops counted once."""
+    return sum(
+        len(equation.invars)
+        if equation.primitive.name in EXCHANGES
+        else sum(_crossing(inner) for inner in _inner(equation))
+        for equation in jaxpr.eqns
+    )
+
+
+def _sent(f, *arguments) -> int:
+    mesh = learner.make_mesh(config.make_config("push", "smoke").train)
+    everywhere = PartitionSpec()
+    f = jax.shard_map(
+        f, mesh=mesh, in_specs=everywhere, out_specs=everywhere, check_vma=False
+    )
+    return _crossing(jax.make_jaxpr(f)(*arguments).jaxpr)
+
+
+def test_gradients_of_a_ppo_step_and_its_divergence_cross_as_one_array():
+    settings = config.make_config("push", "smoke").ppo
+    rows = settings.minibatch_size
+    agent = ppo.init_agent(jax.random.key(0), 3, 2, settings)
+    many = jnp.zeros(rows)
+    batch = ppo.Batch(jnp.zeros((rows, 3)), jnp.zeros((rows, 2)), many, many, many)
+
+    def update(key):
+        return ppo.update(key, agent, batch, settings, "env")
+
+    assert _sent(update, jax.random.key(1)) == 1
+
+
+def test_gradient_of_a_discriminator_step_crosses_as_one_array():
+    settings = discriminator.DiscriminatorConfig()
+    params = networks.init_mlp(jax.random.key(0), (4, 5, 1))
+    network = networks.init_network(params, discriminator.make_optimizer(settings))
+
+    def update(x):
+        return discriminator.update(network, x, x, settings, "env")
+
+    assert _sent(update, jnp.zeros((2, 3, 4))) == 1

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from dcc_jax.learn import networks
@@ -42,28 +43,51 @@ def test_network_is_nonlinear_between_affine_maps(activation, expected):
     )
 
 
-def _network() -> tuple[networks.Network, object]:
-    optimizer = networks.clipped_adam(1.0)
-    layers = (networks.Layer(jnp.ones((2, 1)), jnp.zeros(1)),)
-    return networks.init_network(networks.Mlp(layers), optimizer), optimizer
+RATE = 0.01
+OPTIMIZERS = [networks.clipped_adam(RATE, 1.0), networks.adjustable_adam(RATE, 1.0)]
 
 
-def test_first_adam_step_has_the_length_of_the_rate():
-    network, optimizer = _network()
-    slope = networks.Layer(jnp.array([[0.3], [-0.4]]), jnp.array([0.0]))
-    gradient = networks.Mlp((slope,))
-    after, skipped = networks.apply_gradients(network, gradient, 0.01, optimizer)
+def _layer(kernel: list[float], bias: float) -> networks.Mlp:
+    layer = networks.Layer(jnp.array(kernel)[:, None], jnp.array([bias]))
+    return networks.Mlp((layer,))
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_first_adam_step_has_the_length_of_the_rate(optimizer):
+    network = networks.init_network(_layer([1.0, 1.0], 0.0), optimizer)
+    gradient = _layer([0.3, -0.4], 0.0)
+    after, skipped = networks.apply_gradients(network, gradient, optimizer)
     assert skipped == 0.0
     step = after.params.layers[0].kernel - network.params.layers[0].kernel
-    np.testing.assert_allclose(step[:, 0], [-0.01, 0.01], rtol=1e-3)
+    np.testing.assert_allclose(step[:, 0], [-RATE, RATE], rtol=1e-3)
 
 
-def test_gradient_that_is_not_finite_changes_nothing_and_is_counted():
-    network, optimizer = _network()
-    for bad in (jnp.nan, jnp.inf):
-        slope = networks.Layer(jnp.array([[1.0], [bad]]), jnp.array([1.0]))
-        gradient = networks.Mlp((slope,))
-        after, skipped = networks.apply_gradients(network, gradient, 0.01, optimizer)
-        assert skipped == 1.0
-        same = jax.tree.map(lambda a, b: bool(jnp.all(a == b)), after, network)
-        assert all(jax.tree.leaves(same))
+def test_long_gradient_is_scaled_down_to_the_norm():
+    optimizer = networks.clipped_adam(RATE, max_norm=1.0)
+    network = networks.init_network(_layer([1.0, 1.0], 0.0), optimizer)
+    after, _ = networks.apply_gradients(network, _layer([30.0, -40.0], 0.0), optimizer)
+    # Adam's mean is a tenth of its first gradient: 0.1 (0.6, -0.8).
+    mean = optax.tree.get(after.opt_state, "mu")
+    np.testing.assert_allclose(np.sort(mean), [-0.08, 0.0, 0.06], atol=1e-6)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_gradient_that_is_not_finite_changes_nothing_and_is_counted(bad, optimizer):
+    network = networks.init_network(_layer([1.0, 1.0], 0.0), optimizer)
+    good, _ = networks.apply_gradients(network, _layer([0.3, -0.4], 0.1), optimizer)
+    after, skipped = networks.apply_gradients(good, _layer([1.0, bad], 1.0), optimizer)
+    assert skipped == 1.0
+    adam = after.opt_state.inner_state, good.opt_state.inner_state
+    assert len(jax.tree.leaves(adam[0])) > 2
+    jax.tree.map(np.testing.assert_array_equal, after.params, good.params)
+    jax.tree.map(np.testing.assert_array_equal, *adam)
+
+
+def test_step_follows_a_rate_that_was_changed():
+    optimizer = networks.adjustable_adam(RATE, 1.0)
+    network = networks.init_network(_layer([1.0, 1.0], 0.0), optimizer)
+    network = networks.with_learning_rate(network, jnp.array(0.5))
+    assert networks.learning_rate(network) == 0.5
+    after, _ = networks.apply_gradients(network, _layer([0.3, -0.4], 0.0), optimizer)
+    np.testing.assert_allclose(after.params.layers[0].kernel[:, 0], [0.5, 1.5], 1e-3)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dcc_jax.learn import networks, normalizer, ppo, rollout
+from dcc_jax.learn import normalizer, ppo, rollout
 from toy import Toy
 
 ENVS, STEPS = 8, 30
@@ -134,4 +134,10 @@ def test_broken_environment_is_kept_as_it_was_before():
     np.testing.assert_array_equal(
         result.incident.action, result.transitions.action[t, first]
     )
-    assert networks.apply_mlp(actors.policy.params, result.incident.env.obs).shape
+    # Observation and action belong together: the policy that acted says how likely.
+    mean = actors.policy.mean(result.incident.env.obs)
+    np.testing.assert_allclose(
+        ppo.log_prob(mean, result.incident.action, CONFIG.sigma),
+        result.transitions.log_prob[t, first],
+        rtol=1e-3,
+    )

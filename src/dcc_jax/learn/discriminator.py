@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from dcc_jax.learn import networks, normalizer
+from dcc_jax.learn.exchange import mean_tree
 
 Array = jax.Array
 
@@ -121,6 +122,11 @@ def loss(
     }
 
 
+def make_optimizer(config: DiscriminatorConfig) -> networks.Optimizer:
+    """Adam with the discriminator's step size."""
+    return networks.clipped_adam(config.learning_rate, config.max_gradient_norm)
+
+
 def update(
     network: networks.Network,
     expert: Array,
@@ -141,15 +147,14 @@ def update(
         The network after M steps, and this device's metrics averaged over them; a step
         whose gradient is not finite is left out and counted in `disc/skipped`.
     """
-    optimizer = networks.clipped_adam(config.max_gradient_norm)
+    optimizer = make_optimizer(config)
 
     def step(
         network: networks.Network, batch: tuple[Array, Array]
     ) -> tuple[networks.Network, dict[str, Array]]:
         gradient, metrics = jax.grad(loss, has_aux=True)(network.params, *batch, config)
-        network, skipped = networks.apply_gradients(
-            network, gradient, config.learning_rate, optimizer, axis_name
-        )
+        gradient = mean_tree(gradient, axis_name)
+        network, skipped = networks.apply_gradients(network, gradient, optimizer)
         return network, metrics | {"disc/skipped": skipped}
 
     network, metrics = jax.lax.scan(step, network, (expert, policy))

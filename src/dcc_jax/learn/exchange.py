@@ -20,6 +20,12 @@ from jax.flatten_util import ravel_pytree
 Tree = TypeVar("Tree")
 
 
+def mean_tree(tree: Tree, axis_name: str) -> Tree:
+    """The mean over all devices of every leaf [...], in a single exchange."""
+    flat, restore = ravel_pytree(tree)
+    return restore(jax.lax.pmean(flat, axis_name))
+
+
 def all_gather_tree(tree: Tree, axis_name: str) -> Tree:
     """The values of all devices, leaves [...] -> [D, ...], in a single exchange.
 

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from dcc_jax.learn import networks
+from dcc_jax.learn.exchange import mean_tree
 
 Array = jax.Array
 
@@ -100,7 +101,6 @@ class Agent:
 
     policy: networks.Network
     value: networks.Network
-    learning_rate: Array  # [] of the policy
 
 
 # The adaptive step size stays within these; Rudin (2021) goes up to 1e-2. Where the
@@ -119,23 +119,25 @@ def init_agent(
     policy leaves the pose offsets near zero instead of drawing them at random.
     """
     policy_key, value_key = jax.random.split(key)
-    optimizer = networks.clipped_adam(config.max_gradient_norm)
     policy = networks.init_mlp(
         policy_key,
         (observation_size, *config.hidden, action_size),
         output_gain=0.01,
         activation=config.activation,
     )
-    value = networks.init_mlp(
-        value_key,
-        (observation_size, *config.hidden, 1),
-        activation=config.activation,
-    )
+    sizes = (observation_size, *config.hidden, 1)
+    value = networks.init_mlp(value_key, sizes, activation=config.activation)
+    of_policy, of_value = make_optimizers(config)
     return Agent(
-        policy=networks.init_network(policy, optimizer),
-        value=networks.init_network(value, optimizer),
-        learning_rate=jnp.asarray(config.learning_rate, jnp.float32),
+        policy=networks.init_network(policy, of_policy),
+        value=networks.init_network(value, of_value),
     )
+
+
+def make_optimizers(c: PpoConfig) -> tuple[networks.Optimizer, networks.Optimizer]:
+    """The policy's, whose step size may change, and the value function's."""
+    policy = networks.adjustable_adam(c.learning_rate, c.max_gradient_norm)
+    return policy, networks.clipped_adam(c.value_learning_rate, c.max_gradient_norm)
 
 
 def log_prob(mean: Array, action: Array, sigma: float) -> Array:
@@ -248,33 +250,33 @@ def update(
     skipped = jnp.sum(metrics.pop("ppo/skipped"))
     return agent, jax.tree.map(jnp.mean, metrics) | {
         "ppo/skipped": skipped,
-        "ppo/learning_rate": agent.learning_rate,
+        "ppo/learning_rate": networks.learning_rate(agent.policy),
     }
 
 
 def _step(
     agent: Agent, batch: Batch, config: PpoConfig, axis_name: str
 ) -> tuple[Agent, dict[str, Array]]:
-    optimizer = networks.clipped_adam(config.max_gradient_norm)
-    policy_slope, of_policy = jax.grad(policy_loss, has_aux=True)(
+    policy_optimizer, value_optimizer = make_optimizers(config)
+    policy_gradient, of_policy = jax.grad(policy_loss, has_aux=True)(
         agent.policy.params, batch, config
     )
-    value_slope, of_value = jax.grad(value_loss, has_aux=True)(
+    value_gradient, of_value = jax.grad(value_loss, has_aux=True)(
         agent.value.params, batch, config
     )
-    kl = jax.lax.pmean(of_policy["ppo/kl"], axis_name)
-    rate = _adapted(agent.learning_rate, kl, config.target_kl)
+    policy_gradient, value_gradient, kl = mean_tree(
+        (policy_gradient, value_gradient, of_policy["ppo/kl"]), axis_name
+    )
+    rate = _adapted(networks.learning_rate(agent.policy), kl, config.target_kl)
+    policy = networks.with_learning_rate(agent.policy, rate)
     policy, skipped_policy = networks.apply_gradients(
-        agent.policy, policy_slope, rate, optimizer, axis_name
+        policy, policy_gradient, policy_optimizer
     )
     value, skipped_value = networks.apply_gradients(
-        agent.value, value_slope, config.value_learning_rate, optimizer, axis_name
+        agent.value, value_gradient, value_optimizer
     )
     skipped = {"ppo/skipped": jnp.maximum(skipped_policy, skipped_value)}
-    return (
-        Agent(policy=policy, value=value, learning_rate=rate),
-        of_policy | of_value | skipped,
-    )
+    return Agent(policy=policy, value=value), of_policy | of_value | skipped
 
 
 def _adapted(rate: Array, kl: Array, target: float | None) -> Array:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from dcc_jax.env.rewards import RewardConfig
-from dcc_jax.learn import networks, normalizer, ppo, warm_start
+from dcc_jax.learn import discriminator, networks, normalizer, ppo, warm_start
 from dcc_jax.learn.discriminator import DiscriminatorConfig
 from dcc_jax.learn.exchange import all_gather_tree
 from dcc_jax.learn.ppo import PpoConfig
@@ -164,10 +164,9 @@ def init_state(
     s, _, _ = environment.expert_pairs(expert_key, _EXPERT_SAMPLE)
     width = 2 * environment.feature_size + environment.condition_size
     disc = networks.init_mlp(disc_key, (width, *config.disc.hidden, 1))
-    optimizer = networks.clipped_adam(config.disc.max_gradient_norm)
     return TrainState(
         agent=agent,
-        disc=networks.init_network(disc, optimizer),
+        disc=networks.init_network(disc, discriminator.make_optimizer(config.disc)),
         obs_normalizer=obs_normalizer,
         feature_normalizer=normalizer.moments(s),
         running=running,

@@ -15,8 +15,10 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import optax
 
 from dcc_jax.learn import networks, normalizer, ppo
+from dcc_jax.learn.exchange import mean_tree
 from dcc_jax.learn.normalizer import Normalizer
 from dcc_jax.learn.ppo import PpoConfig
 from dcc_jax.learn.rollout import Environment
@@ -48,22 +50,21 @@ def warm_start(
         axis_name: mesh axis whose devices share the samples.
     """
     local = max(SAMPLES // jax.lax.axis_size(axis_name), 1)
-    optimizer = networks.clipped_adam(config.max_gradient_norm)
+    falling = optax.linear_schedule(LEARNING_RATE, 0.0, steps)
+    optimizer = networks.clipped_adam(falling, config.max_gradient_norm)
 
     def loss(params: networks.Mlp, obs: Array, action: Array) -> Array:
         error = networks.apply_mlp(params, obs) - action
         return jnp.mean(jnp.sum(jnp.square(error), axis=-1))
 
-    def step(policy: networks.Network, at: tuple[Array, Array]):
-        key, left = at
+    def step(policy: networks.Network, key: Array):
         keys = jax.random.split(key, local)
         obs, action = jax.vmap(environment.expert_action)(keys)
         obs = normalizer.normalize(obs_normalizer, obs)
-        slope = jax.grad(loss)(policy.params, obs, action)
-        rate = LEARNING_RATE * left
-        return networks.apply_gradients(policy, slope, rate, optimizer, axis_name)
+        gradient = mean_tree(jax.grad(loss)(policy.params, obs, action), axis_name)
+        return networks.apply_gradients(policy, gradient, optimizer)
 
-    left = 1.0 - jnp.arange(steps) / steps
-    policy, _ = jax.lax.scan(step, agent.policy, (jax.random.split(key, steps), left))
-    fresh = networks.init_network(policy.params, optimizer)
+    begin = networks.init_network(agent.policy.params, optimizer)
+    policy, _ = jax.lax.scan(step, begin, jax.random.split(key, steps))
+    fresh = dataclasses.replace(agent.policy, params=policy.params)
     return dataclasses.replace(agent, policy=fresh)

@@ -1,14 +1,14 @@
 """Whole runs on disk, and policies small enough to ship. No pickle is ever loaded.
 
-A checkpoint is `checkpoints/000000050/` (written by orbax, which renames a finished
-directory into place) and `checkpoints/000000050.sha256`, a digest of every file in it.
-Without its digests a checkpoint is one that was being written when the run was killed.
+A checkpoint is `checkpoints/000000050/`, which orbax's `CheckpointManager` writes
+elsewhere and renames into place when it is whole. It has two items: `state`, every
+array by its name, and `digests`, a SHA-256 of every array. What orbax reads is compared
+with them, so that a damaged checkpoint is never resumed from.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import shutil
 import zipfile
@@ -26,7 +26,7 @@ from dcc_jax.learn.normalizer import Normalizer
 from dcc_jax.learn.rollout import Policy
 
 _FOLDER = "checkpoints"
-_DIGEST = ".sha256"
+_DIGITS = 9  # of an update in the name of its checkpoint
 
 
 class CheckpointError(RuntimeError):
@@ -45,12 +45,18 @@ def save(run_dir: Path, update: int, state: Any, keep: int) -> Path:
     Raises:
         CheckpointError: it could not be written; the earlier ones are as they were.
     """
-    path = run_dir / _FOLDER / f"{update:09d}"
+    path = _path(run_dir, update)
+    arrays = to_arrays(state)
+    items = ocp.args.Composite(
+        state=ocp.args.StandardSave(arrays),
+        digests=ocp.args.JsonSave(_digests(arrays)),
+    )
     try:
-        _remove(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        ocp.PyTreeCheckpointer().save(path.absolute(), to_arrays(state))
-        write_atomically(_digest_file(path), json.dumps(_digests(path)).encode())
+        with _manager(run_dir, keep) as manager:
+            if path.exists():
+                manager.delete(update)
+            # By force: a later one that is damaged would make orbax pass this one over.
+            manager.save(update, args=items, force=True)
     # orbax raises whatever its storage library does: OSError, ValueError, its own.
     except Exception as error:
         _discard(path)
@@ -58,15 +64,13 @@ def save(run_dir: Path, update: int, state: Any, keep: int) -> Path:
         raise CheckpointError(
             f"cannot write checkpoint {path}: {reason[0]}; earlier ones are intact"
         ) from error
-    for old in available(run_dir)[keep:]:
-        _remove(run_dir / _FOLDER / f"{old:09d}")
     return path
 
 
 def available(run_dir: Path) -> list[int]:
     """Updates of the checkpoints that were finished, newest first."""
-    found = (run_dir / _FOLDER).glob(f"*{_DIGEST}")
-    return sorted((int(f.stem) for f in found if f.stem.isdecimal()), reverse=True)
+    found = (run_dir / _FOLDER).glob("*")
+    return sorted((int(p.name) for p in found if p.name.isdecimal()), reverse=True)
 
 
 def restore_latest(
@@ -81,13 +85,15 @@ def restore_latest(
 
     Raises:
         CheckpointError: there are checkpoints, and all are damaged.
-        ValueError: the state has another shape than the template.
+        ValueError: the state has another shape than the template, or an older version
+            of this package wrote the checkpoint.
     """
     updates = available(run_dir)
     for update in updates:
-        path = run_dir / _FOLDER / f"{update:09d}"
+        path = _path(run_dir, update)
+        _refuse_old_format(path)
         try:
-            arrays = _read(path)
+            arrays = _read(run_dir, update)
         except CheckpointError as error:
             say(f"skipping damaged checkpoint {path}: {error}")
             continue
@@ -185,47 +191,61 @@ def _activation(arrays: dict[str, np.ndarray]) -> Activation:
     return cast(Activation, name)
 
 
-def _read(path: Path) -> dict[str, np.ndarray]:
+def _manager(run_dir: Path, keep: int | None = None) -> ocp.CheckpointManager:
+    options = ocp.CheckpointManagerOptions(
+        max_to_keep=keep,
+        step_format_fixed_length=_DIGITS,
+        enable_async_checkpointing=False,
+    )
+    return ocp.CheckpointManager((run_dir / _FOLDER).absolute(), options=options)
+
+
+def _path(run_dir: Path, update: int) -> Path:
+    return run_dir / _FOLDER / f"{update:0{_DIGITS}d}"
+
+
+def _read(run_dir: Path, update: int) -> dict[str, np.ndarray]:
+    items = ocp.args.Composite(
+        state=ocp.args.StandardRestore(), digests=ocp.args.JsonRestore()
+    )
     try:
-        expected = json.loads(_digest_file(path).read_text())
-        actual = _digests(path)
-        changed = sorted(k for k in expected | actual if expected[k] != actual[k])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise CheckpointError(f"a file is missing or unreadable: {error}") from None
+        with _manager(run_dir) as manager:
+            found = manager.restore(update, args=items)
+        arrays, expected = found.state, found.digests
+        actual = _digests(arrays)
+    # As in `save`: there is no telling what damage makes it raise.
+    except Exception as error:
+        reason = str(error).strip().splitlines() or [type(error).__name__]
+        raise CheckpointError(f"orbax cannot read it: {reason[0]}") from error
+    names = expected.keys() | actual.keys()
+    changed = sorted(k for k in names if expected.get(k) != actual.get(k))
     if changed:
         raise CheckpointError(f"{changed[0]} is not what was written")
-    try:
-        return ocp.PyTreeCheckpointer().restore(path.absolute())
-    except Exception as error:
-        raise CheckpointError(f"orbax cannot read it: {error}") from error
+    return arrays
 
 
-def _digests(path: Path) -> dict[str, str]:
-    files = sorted(file for file in path.rglob("*") if file.is_file())
+def _digests(arrays: dict[str, np.ndarray]) -> dict[str, str]:
+    """SHA-256 of type, shape and content of every array."""
     return {
-        str(file.relative_to(path)): hashlib.sha256(file.read_bytes()).hexdigest()
-        for file in files
+        name: hashlib.sha256(
+            f"{array.dtype}{array.shape}".encode() + array.tobytes()
+        ).hexdigest()
+        for name, array in arrays.items()
     }
 
 
-def _digest_file(path: Path) -> Path:
-    return path.with_name(path.name + _DIGEST)
-
-
-def _remove(path: Path) -> None:
-    # Digests first: what is left of a kill in between does not count as a checkpoint.
-    _digest_file(path).unlink(missing_ok=True)
-    if path.exists():
-        shutil.rmtree(path)
+def _refuse_old_format(path: Path) -> None:
+    if path.with_name(f"{path.name}.sha256").exists():
+        raise ValueError(
+            f"{path} was written by an older version of dcc_jax, whose runs cannot be "
+            "resumed; its policy.npz still serves"
+        )
 
 
 def _discard(path: Path) -> None:
-    """Clears away what a failed write left, orbax's own directories included."""
+    """Clears away what a failed write left: orbax does so at no later time either."""
     for left in path.parent.glob(f"{path.name}*"):
-        if left.is_dir():
-            shutil.rmtree(left, ignore_errors=True)
-        else:
-            left.unlink(missing_ok=True)
+        shutil.rmtree(left, ignore_errors=True)
 
 
 def _name(path: Any) -> str:
