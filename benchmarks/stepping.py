@@ -27,7 +27,7 @@ from mujoco import mjx
 from dcc_jax import physics
 
 Array = jax.Array
-CALLS = 3  # timed together: one call takes 20 ms
+TIMED = 6000  # physics steps at least between two looks at the clock, 50 ms
 
 
 @flax.struct.dataclass
@@ -159,16 +159,17 @@ def rates(runs: dict[str, Callable], count: int, rounds: int) -> dict[str, float
         count: physics steps of a call.
         rounds: turns.
     """
+    calls = -(-TIMED // count)
     for run in runs.values():
         run()
     seconds: dict[str, list[float]] = {name: [] for name in runs}
     for _ in range(rounds):
         for name, run in runs.items():
             begin = time.perf_counter()
-            for _ in range(CALLS):
+            for _ in range(calls):
                 run()
             seconds[name].append(time.perf_counter() - begin)
     return {
-        name: CALLS * count / statistics.median(times)
+        name: calls * count / statistics.median(times)
         for name, times in seconds.items()
     }
