@@ -18,15 +18,12 @@ import jax.numpy as jnp
 from stepping import Drive, Job, compiled, compiled_batch
 
 from dcc_jax import physics, tasks
-from dcc_jax.character import asset_path, load_character
 from dcc_jax.env.config import EnvConfig
 from dcc_jax.env.environment import Environment
-from dcc_jax.env.state import EnvState, Plan, Substep
+from dcc_jax.env.state import ControlInputs, EnvState, Substep
 from dcc_jax.env.task import Forces, Nothing, Task
-from dcc_jax.evaluate.runs import Run, find_run
 from dcc_jax.learn import rollout
-from dcc_jax.motion.clip import load_clip
-from dcc_jax.motion.reference import make_references
+from dcc_jax.play.runs import Run, find_run
 
 Array = jax.Array
 CONTROL_STEPS = 60  # from the reset to the states of a training: 2 s
@@ -39,7 +36,7 @@ class Start:
 
     environment: Environment
     carry: Substep  # [B, ...]
-    plan: Plan  # [B, ...]
+    plan: ControlInputs  # [B, ...]
     steps: int  # physics steps of a call, T
 
 
@@ -68,12 +65,11 @@ class Standing(Task):
 
 def standing(count: int) -> Start:
     """Slightly different characters on their soles, held in the T-pose."""
-    references = make_references([load_clip(asset_path("motions/stand.npz"))])
-    environment = Environment(Standing(), load_character(), references, EnvConfig())
+    environment = tasks.make_environment(Standing(), EnvConfig())
     scene = environment.scene
     qpos0 = jnp.asarray(scene.model.qpos0, jnp.float32)
 
-    def begin(key: Array) -> tuple[Substep, Plan]:
+    def begin(key: Array) -> tuple[Substep, ControlInputs]:
         reset_key, qvel_key, step_key = jax.random.split(key, 3)
         qvel = 0.01 * jax.random.normal(qvel_key, (scene.model.nv,))
         state = environment.reset(reset_key)
@@ -98,10 +94,11 @@ def visited(name: str, count: int, noise_degrees: float | None) -> Start:
         noise_degrees: of the actions; None: what the policy was trained with.
     """
     run = _noisy(find_run(name), noise_degrees)
-    environment = tasks.make_environment(run.config)
+    task = tasks.make_task(run.config.task)
+    environment = tasks.make_environment(task, run.config.env)
     share = count // len(jax.devices())
 
-    def begin(key: Array) -> tuple[Substep, Plan]:
+    def begin(key: Array) -> tuple[Substep, ControlInputs]:
         play_key, noise_key, step_key = jax.random.split(key[0], 3)
         states = _played(play_key, run, environment, share)
         noise = jax.random.normal(noise_key, (share, environment.action_size))
@@ -138,7 +135,7 @@ def with_compliance(start: Start) -> Callable[[], tuple[Substep, Drive]]:
     A call gives the end [B, ...] and what acted on the scene on the way [B, T, ...].
     """
 
-    def steps(carry: Substep, plan: Plan) -> tuple[Substep, Drive]:
+    def steps(carry: Substep, plan: ControlInputs) -> tuple[Substep, Drive]:
         def step(carry: Substep, _: None) -> tuple[Substep, Drive]:
             return substep(start.environment, carry, plan)
 
@@ -148,7 +145,7 @@ def with_compliance(start: Start) -> Callable[[], tuple[Substep, Drive]]:
 
 
 def substep(
-    environment: Environment, carry: Substep, plan: Plan
+    environment: Environment, carry: Substep, plan: ControlInputs
 ) -> tuple[Substep, Drive]:
     """One physics step of ONE environment, and what acted on the scene in it."""
     scene, task = environment.scene, environment.task

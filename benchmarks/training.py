@@ -28,7 +28,6 @@ from pathlib import Path
 from typing import Any
 
 from dcc_jax import runtime
-from dcc_jax.training import loop
 
 runtime.setup()
 
@@ -37,6 +36,7 @@ import jax.numpy as jnp  # noqa: E402
 import mujoco  # noqa: E402
 from jax.sharding import NamedSharding, PartitionSpec  # noqa: E402
 from mujoco import mjx  # noqa: E402
+from states import substep  # noqa: E402
 
 from dcc_jax import physics  # noqa: E402
 from dcc_jax.character import compose_scene, load_character  # noqa: E402
@@ -44,9 +44,10 @@ from dcc_jax.config import Config, make_config  # noqa: E402
 from dcc_jax.control import pd  # noqa: E402
 from dcc_jax.env.config import CONTROL_RATE  # noqa: E402
 from dcc_jax.env.environment import Environment  # noqa: E402
-from dcc_jax.env.state import EnvState  # noqa: E402
+from dcc_jax.env.state import EnvState, Substep  # noqa: E402
 from dcc_jax.learn import learner  # noqa: E402
 from dcc_jax.learn.update import chunk_size  # noqa: E402
+from dcc_jax.training import loop  # noqa: E402
 
 Array = jax.Array
 
@@ -80,21 +81,14 @@ def with_minibatches(config: Config, minibatches: int) -> Config:
 
 def physics_alone(environment: Environment, state: EnvState) -> EnvState:
     """The physics steps of a control step: no observation, reward or reset."""
-    scene = environment.scene
     action = jnp.zeros(environment.action_size)
     start, plan = environment.begin(jax.random.key(0), state, action)
 
-    def substep(carry: Any, _: None) -> tuple[Any, None]:
-        world = environment.task.world(scene, carry.task, carry.time)
-        kin = physics.kinematics(scene, carry.body, world)
-        tau = environment.torque(carry, plan)
-        qfrc = scene.scatter_character(tau)
-        qfrc = qfrc + environment.task.applied(scene, carry.task, kin, carry.time)
-        solution = physics.solve(scene, kin, carry.body, qfrc)
-        return environment.react(carry, plan, kin, tau, solution)[0], None
+    def one(carry: Substep, _: None) -> tuple[Substep, None]:
+        return substep(environment, carry, plan)[0], None
 
     steps = environment.config.control_steps
-    end, _ = jax.lax.scan(substep, start, None, length=steps)
+    end, _ = jax.lax.scan(one, start, None, length=steps)
     return state.replace(
         body=end.body, displacement=end.displacement, task=end.task, time=end.time
     )
