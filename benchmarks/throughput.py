@@ -146,7 +146,12 @@ def main() -> None:
         )
         rates[name] = measured(start, rounds, naive=alone)
         print(row(name, rates[name]), flush=True)
-        print(f"({name}: {time.perf_counter() - begin:.0f} s)", file=sys.stderr)
+        apart = rates[name]["apart_p95"]
+        taken = time.perf_counter() - begin
+        print(
+            f"({name}: {taken:.0f} s; C and ours end {apart:.1e} apart)",
+            file=sys.stderr,
+        )
         if alone:
             scene = start.environment.scene
     report |= {"rates": rates, "landings": landing_errors(scene, drops)}
