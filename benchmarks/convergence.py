@@ -13,7 +13,6 @@ import argparse
 import dataclasses
 
 from dcc_jax import runtime
-from dcc_jax.training import loop
 
 runtime.ensure()
 
@@ -25,6 +24,7 @@ from dcc_jax import physics  # noqa: E402
 from dcc_jax.config import make_config  # noqa: E402
 from dcc_jax.env.environment import Environment  # noqa: E402
 from dcc_jax.env.state import EnvState  # noqa: E402
+from dcc_jax.training import loop  # noqa: E402
 
 Array = jax.Array
 AT_MOST, CONVERGED = (2, 3, 4, 5, 6, 8), 24

@@ -28,7 +28,6 @@ from pathlib import Path
 from typing import Any
 
 from dcc_jax import runtime
-from dcc_jax.training import loop
 
 runtime.ensure()
 
@@ -37,6 +36,7 @@ import jax.numpy as jnp  # noqa: E402
 import mujoco  # noqa: E402
 from jax.sharding import NamedSharding, PartitionSpec  # noqa: E402
 from mujoco import mjx  # noqa: E402
+from states import substep  # noqa: E402
 
 from dcc_jax import physics  # noqa: E402
 from dcc_jax.character import compose_scene, load_character  # noqa: E402
@@ -45,9 +45,9 @@ from dcc_jax.control import pd  # noqa: E402
 from dcc_jax.env.config import CONTROL_RATE  # noqa: E402
 from dcc_jax.env.environment import Environment  # noqa: E402
 from dcc_jax.env.state import EnvState, Substep  # noqa: E402
-from dcc_jax.env.substep import physics_step  # noqa: E402
 from dcc_jax.learn import learner  # noqa: E402
 from dcc_jax.learn.update import chunk_size  # noqa: E402
+from dcc_jax.training import loop  # noqa: E402
 
 Array = jax.Array
 
@@ -82,10 +82,10 @@ def with_minibatches(config: Config, minibatches: int) -> Config:
 def physics_alone(environment: Environment, state: EnvState) -> EnvState:
     """The physics steps of a control step: no observation, reward or reset."""
     action = jnp.zeros(environment.action_size)
-    start, inputs = environment.begin(jax.random.key(0), state, action)
+    start, plan = environment.begin(jax.random.key(0), state, action)
 
     def one(carry: Substep, _: None) -> tuple[Substep, None]:
-        return physics_step([environment.side], [carry], [inputs])[0][0], None
+        return substep(environment, carry, plan)[0], None
 
     steps = environment.config.control_steps
     end, _ = jax.lax.scan(one, start, None, length=steps)
@@ -180,7 +180,7 @@ def first_update(config: Config, cache: str) -> float:
     """Seconds from the command to the first line of metrics, in a fresh process."""
     with tempfile.TemporaryDirectory() as folder:
         run_dir = Path(folder) / "run"
-        command = [sys.executable, "-m", "dcc_jax.train", "--task", config.task.name]
+        command = [sys.executable, "-m", "dcc_jax.train", "--task", config.task]
         command += ["--preset", config.preset, "--run-dir", str(run_dir)]
         environ = os.environ | {"DCC_JAX_CACHE": cache}
         begin = time.perf_counter()

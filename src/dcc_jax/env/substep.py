@@ -126,14 +126,35 @@ def physics_step(
     first, carry = sides[0], carries[0]
     world = first.task.world(first.scene, carry.task, carry.time)
     kin = physics.kinematics(first.scene, carry.body, world)
-    both = list(zip(sides, carries, inputs, strict=True))
-    taus = [side.torque(own, given) for side, own, given in both]
-    qfrc = jnp.zeros(first.scene.model.nv)
-    for (side, own, _), tau in zip(both, taus, strict=True):
-        qfrc = qfrc + side.scene.scatter_character(tau)
-        qfrc = qfrc + side.task.applied(side.scene, own.task, kin, own.time)
+    taus, qfrc = scene_forces(sides, carries, inputs, kin)
     solution = physics.solve(first.scene, kin, carry.body, qfrc)
     return [
         side.react(own, given, kin, tau, solution)
-        for (side, own, given), tau in zip(both, taus, strict=True)
+        for side, own, given, tau in zip(sides, carries, inputs, taus, strict=True)
     ]
+
+
+def scene_forces(
+    sides: Sequence[Side],
+    carries: Sequence[Substep],
+    inputs: Sequence[ControlInputs],
+    kin: physics.Kinematics,
+) -> tuple[list[Array], Array]:
+    """What acts on a scene beside its constraints: PD torques and the surroundings.
+
+    Args:
+        sides: as of `physics_step`.
+        carries: likewise.
+        inputs: likewise.
+        kin: at the beginning of the step.
+
+    Returns:
+        the torques [42] of each character, N m, and all generalized forces [nv].
+    """
+    taus, qfrc = [], jnp.zeros(sides[0].scene.model.nv)
+    for side, own, given in zip(sides, carries, inputs, strict=True):
+        tau = side.torque(own, given)
+        qfrc = qfrc + side.scene.scatter_character(tau)
+        qfrc = qfrc + side.task.applied(side.scene, own.task, kin, own.time)
+        taus.append(tau)
+    return taus, qfrc
