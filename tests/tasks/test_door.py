@@ -304,7 +304,7 @@ def test_reward_grows_with_the_angle_up_to_the_target(environment):
 
 
 def test_a_door_that_is_none_is_refused():
-    with pytest.raises(ValueError, match=r"door\.width must be positive, got -1\.0"):
+    with pytest.raises(ValueError, match=r"task\.width must be positive, got -1\.0"):
         Door(width=-1.0)
-    with pytest.raises(ValueError, match=r"door\.damping"):
+    with pytest.raises(ValueError, match=r"task\.damping"):
         Door(damping=float("nan"))

@@ -1,7 +1,7 @@
 """One environment: a task, a character and its reference, step by step.
 
 A control step is `control_steps` physics steps (`env.substep`), then the state (Sec.
-4.2), the positional and the task reward (Eq. 14), and whether the episode ends. It
+4.2), the positional and the task reward (Eq. (14)), and whether the episode ends. It
 knows no task and no discriminator; both come from outside.
 """
 

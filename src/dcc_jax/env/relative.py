@@ -1,4 +1,4 @@
-"""How fast points of the character move against its reference (Eq. 8).
+"""How fast points of the character move against its reference (Eq. (8)).
 
 Written for ONE environment. F points, each fixed to a body.
 """

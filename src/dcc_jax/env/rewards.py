@@ -1,4 +1,7 @@
-"""The reward of Sec. 4.1 (Eq. 10, 11, 13, 14). Arrays in, arrays out, any batch."""
+"""The reward of Sec. 4.1: Eq. (10), Eq. (11), Eq. (13) and Eq. (14).
+
+Arrays in, arrays out, any batch.
+"""
 
 from __future__ import annotations
 

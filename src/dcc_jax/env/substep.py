@@ -1,6 +1,6 @@
 """One physics step of the characters in a scene, each with its task and its u.
 
-    kinematics -> PD torques (Eq. 2) -> MJX -> external forces -> u (Alg. 1) -> advance
+    kinematics -> PD torques, Eq. (2) -> MJX -> external forces -> u, Alg. 1 -> advance
 
 Everything is written for ONE scene.
 """

@@ -120,7 +120,7 @@ class Task:
     def root_target(
         self, scene: physics.Scene, state: Any, start: RootTarget, time: Array
     ) -> RootTarget:
-        """The reference's root at a moment, which r_p compares the root with (Eq. 14).
+        """The reference's root at a moment, which r_p compares with (Eq. (14)).
 
         Here: where the episode began, going on at the mean velocity of its clip where
         that is a loop that travels, such as a walk; at rest with every other clip.

@@ -44,7 +44,7 @@ METRICS: dict[str, tuple[str, str]] = {
 """Columns of the rows: unit and meaning. A task's own come on top, as
 `task/<name>/mean`, `/min`, `/max` and `/final`.
 
-Forces are those that the compliance hears, measured at the physics rate. A contact is a
+Forces are those passed to the compliance controller, measured at the physics rate. A contact is a
 time without pause in which one acts, to the control step; where a row has a contact
 metric it is the mean over the contacts of the episode.
 """

@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dcc_jax import runtime
 from dcc_jax.env.config import CONTROL_RATE
 from dcc_jax.env.task import Task
 from dcc_jax.evaluate import bootstrap, compare, measures
@@ -108,7 +107,6 @@ def prepare(
     control: bool = True,
 ) -> EvaluationPlan:
     """Checks everything a user can get wrong; arguments as of `evaluate`."""
-    runtime.ensure()
     names = [run_dir] if isinstance(run_dir, str | Path) else list(run_dir)
     runs = [find_run(name) for name in names]
     if isinstance(alpha, float | int):

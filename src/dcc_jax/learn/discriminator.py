@@ -1,4 +1,4 @@
-"""The adversarial motion network of Sec. 4.1, Eq. 12.
+"""The adversarial motion network of Sec. 4.1, Eq. (12).
 
 Letters: N pairs, F body features, C condition, M minibatches, W = 2 F + C inputs.
 """
@@ -75,7 +75,7 @@ def inputs(n: normalizer.Normalizer, pairs: Pairs) -> Array:
 
 
 def score(params: networks.Mlp, x: Array) -> Array:
-    """D(s, s') [...] for inputs x [..., W]; 1 on clips, -1 on the policy (Eq. 12)."""
+    """D(s, s') [...] for inputs x [..., W]; 1 on clips, -1 on the policy (Eq. (12))."""
     return networks.apply_mlp(params, x)[..., 0]
 
 
@@ -92,7 +92,7 @@ def gradient_penalty(params: networks.Mlp, x: Array) -> Array:
 def loss(
     params: networks.Mlp, expert: Array, policy: Array, config: DiscriminatorConfig
 ) -> tuple[Array, dict[str, Array]]:
-    """Eq. 12 with gradient penalty and last-layer penalty.
+    """Eq. (12) with gradient penalty and last-layer penalty.
 
     Args:
         params: of the discriminator.

@@ -33,7 +33,7 @@ class PpoConfig:
     """Standard deviation of every action (Sec. 5.1)."""
 
     discount: float = 0.95
-    """gamma of Eq. 9 (Sec. 5.1)."""
+    """gamma of Eq. (9) (Sec. 5.1)."""
 
     gae_lambda: float = 0.95
     """lambda of the generalized advantage estimate (Sec. 5.1)."""

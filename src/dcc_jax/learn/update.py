@@ -128,7 +128,7 @@ def _rewards(
     environment: Environment,
     config: LearnerConfig,
 ) -> tuple[Array, dict[str, Array]]:
-    """Eq. 10, 11 and 13: the reward [T, B], and the means of its parts."""
+    """Eq. (10), (11) and (13): the reward [T, B], and the means of its parts."""
     weights = config.env.reward
     if environment.tracks_reference:
         r_q = transitions.r_q

@@ -30,7 +30,7 @@ class Motion:
     qpos: Array  # [..., nq] of the scene at the end of the control step
     u: Array  # [..., 55]
     reference: Array  # [..., 55] q_m(t), where the task follows its clip in time
-    force_w: Array  # [..., F, 3] N, that the compliance hears
+    force_w: Array  # [..., F, 3] N, passed to the compliance controller
     point_w: Array  # [..., F, 3] m
     mocap_pos: Array  # [..., nmocap, 3] m, of the scene's kinematic bodies
     mocap_quat: Array  # [..., nmocap, 4]

@@ -15,7 +15,6 @@ import jax
 import numpy as np
 from matplotlib.image import imsave
 
-from dcc_jax import runtime
 from dcc_jax.env.config import CONTROL_RATE
 from dcc_jax.env.task import Task
 from dcc_jax.play.player import Player
@@ -97,7 +96,6 @@ def prepare(
         raise ValueError(f"alpha must be in [0, 1], got {alpha}")
     if not 0 <= seed < 2**32:
         raise ValueError(f"seed must be between 0 and 2^32 - 1, got {seed}")
-    runtime.ensure()
     run = find_run(run_dir)
     if out is None and strip is None:
         out = f"{Path(run.name).resolve().name}.mp4"

@@ -36,11 +36,12 @@ def make_environment(task: Task, config: EnvConfig) -> Environment:
         ValueError: clips that are missing or do not suit the task.
         MotionError: a clip that cannot be read.
     """
-    runtime.ensure()
     try:
-        references = make_references(_clips(task, config))
+        clips = _clips(task, config)
     except FileNotFoundError as error:
         raise ValueError(f"{error}") from None
+    runtime.ensure()
+    references = make_references(clips)
     return Environment(task, load_character(config.mass), references, config)
 
 

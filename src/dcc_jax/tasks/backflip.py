@@ -32,13 +32,13 @@ class Backflip(Trampoline):
     start_radius: ClassVar[float] = 0.05
 
     interval: float = 100.0
-    """s; the plate kicks once."""
+    """Time between two kicks, s: longer than an episode, so the plate kicks once."""
     kick: float = 1500.0
-    """N, upward on the plate, for `kick_time`."""
+    """Upward force of the kick on the plate, N."""
     kick_at: float = 1.2
-    """s into the clip, when the legs begin to push."""
+    """Moment of the clip at which the kick begins, s: the legs begin to push."""
     kick_spread: float = 0.03
-    """s by which it may come earlier or later; the policy sees it coming."""
+    """How much earlier or later the kick may come, s; the policy observes when."""
 
     def reset(
         self, key: Array, scene: physics.Scene, reference: RefState

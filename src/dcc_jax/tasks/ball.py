@@ -2,7 +2,7 @@
 
 A pole pivots on the crown and carries a ball at its tip; now and then the ball is
 pushed. Six more actions are fictional forces at the head and at the root. They do not
-act in the simulation: the compliance alone hears them, so that the policy can deform
+act in the simulation: they are passed to the compliance controller alone, so that the policy can deform
 the body, and move it, without leaving its reference.
 
 Departure: a stand is followed in time (Appendix) where the paper has a discriminator.
@@ -68,40 +68,41 @@ class Ball(Task):
     camera_height: ClassVar[float] = 1.4
 
     pole_length: float = 1.0
-    """m from the pivot to the middle of the ball; the paper gives none. A longer pole
-    tips more slowly."""
+    """Distance from the pivot to the middle of the ball, m; the paper gives none. A
+    longer pole tips more slowly."""
     pole_mass: float = 0.2
-    """kg, spread along the pole."""
+    """Mass of the pole, kg, spread along it."""
     ball_radius: float = 0.12
-    """m, of a basketball."""
+    """Radius of the ball, m; that of a basketball."""
     ball_mass: float = 0.6
-    """kg, likewise."""
+    """Mass of the ball, kg; that of a basketball."""
     tilt: float = 0.03
-    """rad, the pole leans by up to this in x and in y at the reset."""
+    """Largest lean of the pole in x and in y at the reset, rad."""
     interval: float = 2.0
-    """s between two pushes."""
+    """Time between two pushes of the ball, s."""
     push: tuple[float, float] = (0.03, 0.1)
-    """m/s, what a push adds to the ball's velocity, in any horizontal direction. To
+    """Least and greatest velocity that a push adds to the ball, m/s, in any horizontal
+    direction. To
     catch 0.3 m/s the head has to be 0.1 m further within 0.3 s, which takes a step."""
     dropped: float = 0.3
-    """rad; with the pole leaning more than this the ball is lost: standing, nobody
+    """Lean of the pole from which on the ball is lost, rad: standing, nobody
     brings it back. At 0.8 rad a quarter of all that is seen at first are such falls."""
     head_force: float = 1000.0
-    """N of fictional force at the head for an action of 1; 0 takes it away. At alpha =
+    """Fictional force at the head for an action of 1, N; 0 takes it away. At alpha =
     0.16 it takes the head of the standing character 0.13 m/s sideways or ahead."""
     root_force: float = 10000.0
-    """N at the root, likewise; 0.12 m/s."""
+    """The same at the root, N; 0.12 m/s."""
 
     def __post_init__(self) -> None:
         positive = ("pole_length", "pole_mass", "ball_radius", "ball_mass", "interval")
         for name in positive:
             value = getattr(self, name)
             if not 0.0 < value < math.inf:
-                raise ValueError(f"ball.{name} must be positive, got {value}")
+                raise ValueError(f"task.{name} must be positive, got {value}")
         for name in ("tilt", "head_force", "root_force"):
             value = getattr(self, name)
             if not 0.0 <= value < math.inf:
-                raise ValueError(f"ball.{name} must be 0 or more, got {value}")
+                raise ValueError(f"task.{name} must be 0 or more, got {value}")
 
     def extend(self, spec: mujoco.MjSpec) -> None:
         """Pole and ball, and the ball joint that stands them on the crown."""

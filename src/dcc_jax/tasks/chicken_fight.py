@@ -83,23 +83,23 @@ class ChickenFight(Task):
     then."""
 
     prefix: str = ""
-    """Of the character's names in the scene."""
+    """Prefix of the character's names in the scene."""
     opponent: str = "box"
     """The opponent's root joint, or the first of a box's; it starts with x and y."""
     gaits: Gaits = field(default_factory=lambda: Gaits(speeds=(0.0, 0.05, 0.1)))
     """How the reference's root moves: up to 5 cm a hop, with legs that hop in place."""
     interval: float = 3.0
-    """s between two attacks."""
+    """Time between two attacks, s."""
     speed: tuple[float, float] = (0.2, 0.6)
-    """m/s of the box when it comes: who hops 0.2 m a hop comes at 0.4 m/s."""
+    """Least and greatest speed of the box, m/s. Hops of 0.2 m make 0.4 m/s."""
     distance: float = 1.0
-    """m between box and root when it sets off."""
+    """Distance between box and root when the box sets off, m."""
     off_centre: float = 0.15
-    """m, at most, by which it aims beside the root: bumps turn the character, too."""
+    """Largest distance beside the root that the box aims at, m: bumps also turn."""
     let_go: float = 0.3
-    """s after the first touch when the box begins to brake."""
+    """Time from the first touch until the box begins to brake, s."""
     brake_time: float = 0.2
-    """s, time constant of its braking."""
+    """Time constant of the box's braking, s."""
 
     def extend(self, spec: mujoco.MjSpec) -> None:
         """A box as heavy as the character that touches its trunk and arms."""

@@ -71,18 +71,18 @@ class Door(Task):
     camera_azimuth: ClassVar[float] = 20.0  # the door hides what is behind it
 
     width: float = 1.0
-    """m from hinge to knob; 1.0 in training, up to 1.7 in evaluation (Sec. 5.4)."""
+    """Distance from hinge to knob, m; evaluated from 1.0 to 1.7 (Sec. 5.4)."""
     density: float = 12.0
-    """kg per m^2 of door: one 0.9 m wide weighs what a solid inner door does."""
+    """Mass of the door per area, kg/m^2: 0.9 m wide, as a solid inner door."""
     damping: float = 10.0
-    """N m s/rad, of the hinge."""
+    """Damping of the hinge, N m s/rad."""
     reach: float = 0.05
-    """m, from the palm to the knob; closer than this the hand takes hold."""
+    """Distance from palm to knob within which the hand takes hold, m."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not 0.0 < value < math.inf:
-                raise ValueError(f"door.{name} must be positive, got {value}")
+                raise ValueError(f"task.{name} must be positive, got {value}")
 
     @property
     def hinge(self) -> tuple[float, float]:

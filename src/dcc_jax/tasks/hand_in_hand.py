@@ -76,11 +76,11 @@ class HandInHand(Task):
     gaits: Gaits = field(default_factory=Gaits)
     """What the partner does."""
     bounce: float = 0.03
-    """m, how far the hand rocks up and down in a run; less at lower speed."""
+    """How far the partner's hand rocks up and down in a run, m; less at lower speed."""
     longest_gap: float = 0.15
-    """m between the hands; beyond it they have parted."""
+    """Gap between the hands beyond which they have parted, m."""
     farthest: float = 1.2
-    """m between the root and the reference's; beyond it the character is dragged."""
+    """Distance of the root from the reference's beyond which an episode ends, m."""
 
     def extend(self, spec: mujoco.MjSpec) -> None:
         """The partner and the ball joint between the hands."""

@@ -52,15 +52,15 @@ class Push(Task):
     clock: ClassVar[str | None] = "since_throw"
 
     interval: float = 1.5
-    """s between two throws."""
+    """Time between two throws, s."""
     mass: float = 1.0
-    """kg, Sec. 5.2."""
+    """Mass of the ball, kg (Sec. 5.2)."""
     radius: float = 0.1
-    """m."""
+    """Radius of the ball, m."""
     speed: tuple[float, float] = (2.0, 3.0)
-    """m/s at the release, Sec. 5.2."""
+    """Least and greatest speed of the ball at the release, m/s (Sec. 5.2)."""
     distance: float = 0.8
-    """m from the root at the release."""
+    """Distance of the ball from the root at the release, m."""
 
     def extend(self, spec: mujoco.MjSpec) -> None:
         """A ball that touches the character's trunk, head and upper arms."""

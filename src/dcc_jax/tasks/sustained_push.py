@@ -57,17 +57,18 @@ class SustainedPush(Task):
     """Where it should go: stops, turns and changes of speed."""
 
     bodies: tuple[str, ...] = ("pelvis", "chest", "head", "left_hand", "right_hand")
-    """That may be pushed, at their centres of mass."""
+    """Bodies that may be pushed, at their centres of mass."""
     strength: tuple[float, float] = (20.0, 80.0)
-    """N; a tenth of the weight, and more, for seconds."""
+    """Least and greatest force, N; 64 N is a tenth of the weight."""
     duration: tuple[float, float] = (1.0, 3.0)
-    """s of a push."""
+    """Least and greatest duration of a push, s."""
     pause: tuple[float, float] = (0.5, 1.5)
-    """s between two."""
+    """Least and greatest pause between two pushes, s."""
     slope: float = 0.3
-    """rad, at most, of the force above or below the ground plane."""
+    """Largest angle of the force above or below the ground plane, rad."""
     leash: float = 0.8
-    """m, at most, between the root and the reference's at the start of a control step.
+    """Largest distance between the root and the reference's at the start of a control
+    step, m.
     With a path that did not wait, most episodes ended where it was lost."""
 
     def first_reference(

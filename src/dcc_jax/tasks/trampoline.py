@@ -52,21 +52,21 @@ class Trampoline(Task):
     clock: ClassVar[str | None] = "since_bounce"
 
     interval: float = 3.0
-    """s between two bounces, Sec. 5.3."""
+    """Time between two bounces, s (Sec. 5.3)."""
     plate_mass: float = 20.0
-    """kg."""
+    """Mass of the plate, kg."""
     stiffness: float = 8000.0
-    """N/m of the four corners together: the standing character sinks it by 8 cm."""
+    """Stiffness of the four corners together, N/m: a standing character sinks 8 cm."""
     damping: float = 500.0
-    """N s/m, together; a damping ratio of 0.3 with the character on it."""
+    """Damping of the four together, N s/m: a ratio of 0.3 with the character on it."""
     kick: float = 2400.0
-    """N, upward on the plate, for `kick_time`."""
+    """Upward force of a kick on the plate, N."""
     kick_time: float = 0.2
-    """s."""
+    """Duration of a kick, s."""
     absorb_time: float = 1.0
-    """s after a landing in which the controller listens, Sec. 5.3."""
+    """Time after a landing in which contact forces count, s (Sec. 5.3)."""
     flight_time: float = 0.08
-    """s without contact that make the next touch a landing."""
+    """Time without contact that makes the next touch a landing, s."""
 
     @property
     def has_floor(self) -> bool:

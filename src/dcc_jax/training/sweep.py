@@ -91,7 +91,7 @@ def sweep(
     Args:
         config: of every run; its seed is replaced.
         seeds: of the runs, or one.
-        alpha: levels of compliance (Eq. 6), or one; None: as the environment's own
+        alpha: levels of compliance (Eq. (6)), or one; None: as the environment's own
             configuration says.
         run_dir: where everything goes; default `runs/sweep-<task>-<time>`.
         resume: continue the sweep in `run_dir`, bit for bit.
