@@ -44,9 +44,9 @@ METRICS: dict[str, tuple[str, str]] = {
 """Columns of the rows: unit and meaning. A task's own come on top, as
 `task/<name>/mean`, `/min`, `/max` and `/final`.
 
-Forces are those passed to the compliance controller, measured at the physics rate. A contact is a
-time without pause in which one acts, to the control step; where a row has a contact
-metric it is the mean over the contacts of the episode.
+Forces are those passed to the compliance controller, measured at the physics rate. A
+contact is a time without pause in which one acts, to the control step; where a row has
+a contact metric it is the mean over the contacts of the episode.
 """
 
 CURVES = (

@@ -2,8 +2,8 @@
 
 A pole pivots on the crown and carries a ball at its tip; now and then the ball is
 pushed. Six more actions are fictional forces at the head and at the root. They do not
-act in the simulation: they are passed to the compliance controller alone, so that the policy can deform
-the body, and move it, without leaving its reference.
+act in the simulation: they are passed to the compliance controller alone, so that the
+policy can deform the body, and move it, without leaving its reference.
 
 Departure: a stand is followed in time (Appendix) where the paper has a discriminator.
 Episodes that begin in the middle of a recovery step lose the ball before anything can

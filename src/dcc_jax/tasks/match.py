@@ -1,7 +1,7 @@
 """A chicken fight of two characters in one scene, each with its own policy (Sec. 5.3).
 
 Each is an environment of its own that was trained against the box; here they share the
-physics, and what acts on each from the other is what the box was to it. Everything is pure
+physics, and each is to the other what the box was. Everything is pure
 and of ONE match, as in `env.environment`.
 """
 
