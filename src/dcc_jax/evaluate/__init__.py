@@ -22,6 +22,7 @@ def evaluate(
     seed: int = 0,
     seconds: float | None = None,
     task: Task | None = None,
+    control: bool = True,
     say: Callable[[str], None] = lambda _: None,
 ) -> Report:
     """Measures policies; `dcc_jax.evaluate.report.evaluate` says what they are."""
@@ -34,5 +35,6 @@ def evaluate(
         seed=seed,
         seconds=seconds,
         task=task,
+        control=control,
         say=say,
     )

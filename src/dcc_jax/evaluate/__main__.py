@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
 PROGRAM = "dcc_jax.evaluate"
 _DESCRIPTION = """Plays episodes of a trained policy's mean action and measures them.
-Every level of compliance meets the same initial states and perturbations. Exit status:
+Every level of compliance meets the same initial states and perturbations. Where levels
+are compared, a control arm tells the policy alpha and displaces nothing. Exit status:
 0 done; 2 a bad argument; 1 a failure."""
 
 
@@ -41,6 +42,12 @@ def _parser() -> command.Parser:
         metavar="A",
         help="levels of compliance, the first is the baseline (those of the training)",
     )
+    add(
+        "--control",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="play each level above 0 also with u off (yes)",
+    )
     add("--seconds", type=float, metavar="S", help="of an episode (as in training)")
     add("--seed", type=int, default=0, metavar="N", help="of all that is drawn (0)")
     add("--json", type=Path, metavar="FILE", help="everything, raw rows included")
@@ -64,6 +71,7 @@ def _plan(options: argparse.Namespace) -> EvaluationPlan:
         options.seconds,
         None,
         lambda text: print(text, file=sys.stderr),
+        options.control,
     )
 
 

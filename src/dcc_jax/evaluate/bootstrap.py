@@ -1,4 +1,4 @@
-"""Means and paired ratios with intervals, from resampled episodes.
+"""Shares, means and paired ratios with their intervals.
 
 Letters: N episodes, R resamples.
 """
@@ -8,10 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.stats
 
 RESAMPLES = 2000
 LEVEL = 0.95
-_Z = 1.959964  # normal quantile of LEVEL
 
 
 @dataclass(frozen=True)
@@ -38,13 +38,9 @@ def share(values: np.ndarray) -> Interval:
 
     A bootstrap would claim certainty where nothing was ever seen to happen.
     """
-    n = len(values)
-    p = float(np.mean(values))
-    middle = (p + _Z**2 / (2 * n)) / (1 + _Z**2 / n)
-    half = _Z / (1 + _Z**2 / n) * np.sqrt(p * (1 - p) / n + _Z**2 / (4 * n**2))
-    # Exact at 0 and 1, where rounding would put the share outside its interval.
-    low, high = max(0.0, float(middle - half)), min(1.0, float(middle + half))
-    return Interval(p, min(low, p), max(high, p))
+    seen = scipy.stats.binomtest(int(np.sum(values)), len(values))
+    found = seen.proportion_ci(LEVEL, method="wilson")
+    return Interval(float(seen.statistic), float(found.low), float(found.high))
 
 
 def ratio(values: np.ndarray, baseline: np.ndarray, resamples: np.ndarray) -> Interval:

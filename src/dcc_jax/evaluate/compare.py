@@ -23,10 +23,20 @@ POOLED = {
 
 @dataclass(frozen=True)
 class Condition:
-    """A policy at a level of compliance."""
+    """An arm: a policy that observes alpha, with or without what alpha does.
+
+    A policy that observes alpha may stand differently for it, and would do so without
+    any compliance. The control arm, with u off, tells the two apart.
+    """
 
     run: str
-    alpha: float
+    alpha: float  # that the policy observes, or the nearest it was trained with
+    u_on: bool = True  # False: the compliance controller displaces nothing
+
+    @property
+    def level(self) -> float:
+        """The alpha of the compliance controller."""
+        return self.alpha if self.u_on else 0.0
 
 
 @dataclass(frozen=True)
@@ -43,7 +53,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A condition against its run's first, or the first of all if each run has one."""
+    """A condition against another one, episode by episode."""
 
     condition: int  # index into Report.conditions
     baseline: int
@@ -52,15 +62,30 @@ class Comparison:
 
 
 def comparisons(parts: list[Part], resamples: np.ndarray) -> list[Comparison]:
-    """Each condition against its baseline; arguments as of `summary`."""
-    several = any(p.condition.run == parts[0].condition.run for p in parts[1:])
-    found = []
-    for i, part in enumerate(parts):
-        same = [j for j, p in enumerate(parts) if p.condition.run == part.condition.run]
-        baseline = same[0] if several else 0
+    """What is compared; arguments as of `summary`."""
+    pairs = paired([part.condition for part in parts])
+    return [_compared(parts, i, j, resamples) for i, j in pairs]
+
+
+def paired(conditions: list[Condition]) -> list[tuple[int, int]]:
+    """Which condition is compared with which, as indices.
+
+    Every condition with the baseline: the first of its run, or the first of all where
+    each run has one level. Then those with u on with their control arms: since
+    (on - baseline) - (off - baseline) = on - off, that is the effect of compliance
+    alone, what the policy does on being told alpha taken away.
+    """
+    levels = [i for i, c in enumerate(conditions) if c.u_on]
+    several = len({conditions[i].run for i in levels}) < len(levels)
+    found, effects = [], []
+    for i, c in enumerate(conditions):
+        same = [j for j in levels if conditions[j].run == c.run]
+        baseline = same[0] if several else levels[0]
         if i != baseline:
-            found.append(_compared(parts, i, baseline, resamples))
-    return found
+            found.append((i, baseline))
+        if not c.u_on:
+            effects += [(j, i) for j in same if conditions[j].alpha == c.alpha]
+    return found + effects
 
 
 def summary(part: Part, resamples: np.ndarray) -> dict[str, Interval]:

@@ -37,8 +37,8 @@ class Report:
     conditions: list[Condition]
     summary: list[dict[str, Interval]]  # of each condition, by metric
     comparisons: list[Comparison]
-    rows: list[dict[str, Any]]  # one an episode: run, alpha, episode, metrics
-    contacts: list[dict[str, Any]]  # one a contact: run, alpha, episode, start, ...
+    rows: list[dict[str, Any]]  # one an episode: run, alpha, u_on, episode, metrics
+    contacts: list[dict[str, Any]]  # one a contact: likewise, start, peak, ...
     clock: str | None  # what the curves are drawn over; None: time since the reset
     curves: list[dict[str, list[list[float]]]]  # of each condition: s, mean, half width
     survival: list[list[float]]  # of each condition: share standing after each step
@@ -56,6 +56,7 @@ def evaluate(
     seed: int = 0,
     seconds: float | None = None,
     task: Task | None = None,
+    control: bool = True,
     say: Callable[[str], None] = lambda _: None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Report:
@@ -71,13 +72,15 @@ def evaluate(
         seed: of everything that is drawn.
         seconds: length of an episode; None: as in training.
         task: in place of the configured one, e.g. with other parameters.
+        control: where levels are compared, play each level above 0 once more with u
+            off: the policy observes alpha, and nothing is displaced.
         say: told what a reader of the numbers has to know.
         progress: told control steps done and to be done.
 
     Raises:
         ValueError: naming the argument, its value and what is allowed.
     """
-    plan = prepare(run_dir, episodes, alpha, seed, seconds, task, say)
+    plan = prepare(run_dir, episodes, alpha, seed, seconds, task, say, control)
     return execute(plan, progress)
 
 
@@ -85,7 +88,7 @@ def evaluate(
 class EvaluationPlan:
     """An evaluation that is about to begin: its input is checked."""
 
-    conditions: list[tuple[Run, float]]
+    conditions: list[tuple[Run, Condition]]
     players: dict[str, Player]  # by run
     episodes: int
     seed: int
@@ -100,13 +103,14 @@ def prepare(
     seconds: float | None,
     task: Task | None,
     say: Callable[[str], None],
+    control: bool = True,
 ) -> EvaluationPlan:
     """Checks everything a user can get wrong; arguments as of `evaluate`."""
     names = [run_dir] if isinstance(run_dir, str | Path) else list(run_dir)
     runs = [find_run(name) for name in names]
     _check(runs, episodes, alpha, seed, seconds)
     return EvaluationPlan(
-        conditions=[(run, level) for run in runs for level in _levels(run, alpha, say)],
+        conditions=_conditions([(r, _levels(r, alpha, say)) for r in runs], control),
         players=_players(runs, task),
         episodes=episodes,
         seed=seed,
@@ -120,19 +124,19 @@ def execute(plan: EvaluationPlan, progress: Callable[[int, int], None]) -> Repor
     total = steps * len(plan.conditions)
     parts: list[Part] = []
     clips: dict[Player, style.Reference] = {}
-    for i, (run, level) in enumerate(plan.conditions):
+    for i, (run, condition) in enumerate(plan.conditions):
         player = plan.players[run.name]
         recording = player.play(
             run,
             range(plan.episodes),
-            [level] * plan.episodes,
+            [condition.level] * plan.episodes,
+            observed_alpha=[condition.alpha] * plan.episodes,
             seed=plan.seed,
             seconds=plan.seconds,
             progress=lambda done, i=i: progress(i * steps + done, total),
         )
         if player not in clips:
             clips[player] = _clips(player)
-        condition = Condition(run.name, level)
         parts.append(_part(player, clips[player], recording, condition))
     return _report(parts, plan)
 
@@ -178,6 +182,19 @@ def _levels(
             "policy observes the nearest alpha that it knows"
         )
     return [float(level) for level in alpha]
+
+
+def _conditions(
+    levels: list[tuple[Run, list[float]]], control: bool
+) -> list[tuple[Run, Condition]]:
+    """Every level of every run, then its control arms."""
+    control = control and len({x for _, xs in levels for x in xs}) > 1
+    found = []
+    for run, own in levels:
+        found += [(run, Condition(run.name, x)) for x in own]
+        if control:
+            found += [(run, Condition(run.name, x, u_on=False)) for x in own if x > 0.0]
+    return found
 
 
 def _players(runs: list[Run], task: Task | None) -> dict[str, Player]:

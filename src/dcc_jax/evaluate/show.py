@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from rich.console import Group
 from rich.table import Table
 
 from dcc_jax.evaluate.bootstrap import Interval
@@ -32,21 +35,37 @@ NO_RATIO = ("fell", "u/", "contact/energy", "contact/foot", "energy", "range", "
 COLUMNS = 3
 
 
-def table(report: Report) -> Table:
-    """One row a metric, one column a condition, one more a comparison."""
-    page = Table(title=f"{_title(report)}; means [95 % interval]", title_justify="left")
-    page.add_column("", no_wrap=True)
-    for i, _ in enumerate(report.conditions):
-        page.add_column(_name(report, i), justify="right")
-    for comparison in report.comparisons:
-        page.add_column(_versus(report, comparison), justify="right")
-    known = METRICS | POOLED
+def table(report: Report) -> Group:
+    """Two tables, a row a metric: the conditions, then what they are compared."""
+    means = _table(
+        f"{_title(report)}; means [95 % interval]",
+        [_name(report, i) for i, _ in enumerate(report.conditions)],
+    )
+    compared = _table(
+        "paired ratios of means, or differences [95 % interval]",
+        [_versus(report, comparison) for comparison in report.comparisons],
+    )
     for name in report.summary[0]:
-        unit = known[name][0] if name in known else ""
-        cells = [_text(summary[name]) for summary in report.summary]
-        cells += [_compared(comparison, name) for comparison in report.comparisons]
-        page.add_row(f"{name} {unit and f'({unit})'}", *cells)
+        means.add_row(_row_name(name), *[_text(s[name]) for s in report.summary])
+    for name in report.rows[0] if report.comparisons else ():
+        if name in report.comparisons[0].ratio:
+            compared.add_row(
+                _row_name(name), *[_compared(c, name) for c in report.comparisons]
+            )
+    return Group(means, compared) if report.comparisons else Group(means)
+
+
+def _table(title: str, columns: list[str]) -> Table:
+    page = Table(title=title, title_justify="left")
+    page.add_column("", no_wrap=True)
+    for column in columns:
+        page.add_column(column, justify="right")
     return page
+
+
+def _row_name(metric: str) -> str:
+    unit = (METRICS | POOLED).get(metric, ("", ""))[0]
+    return f"{metric} ({unit})" if unit else metric
 
 
 def check_format(path: Path) -> None:
@@ -63,6 +82,7 @@ def check_format(path: Path) -> None:
 def figure(report: Report, path: Path) -> None:
     """Writes a page: who stands, how hard contacts are, ratios, and curves over time.
 
+    Control arms are dashed.
     Curves show the mean over episodes and its 95 % interval.
     """
     names = [name for name, *_ in CURVES] + sorted(
@@ -88,30 +108,29 @@ def figure(report: Report, path: Path) -> None:
 def _draw_survival(axes: Axes, report: Report) -> None:
     for i, share in enumerate(report.survival):
         time = DT * np.arange(1, len(share) + 1)
-        axes.plot(time, share, color=_colour(i), label=_name(report, i))
+        axes.plot(time, share, **_line(report, i), label=_name(report, i))
     axes.set(title="share still standing", xlabel="s", ylim=(-0.03, 1.03))
     axes.legend(fontsize=8, loc="lower left")
 
 
 def _draw_peaks(axes: Axes, report: Report) -> None:
     for i, condition in enumerate(report.conditions):
-        peaks = sorted(
-            contact["peak"]
-            for contact in report.contacts
-            if (contact["run"], contact["alpha"]) == (condition.run, condition.alpha)
-        )
-        axes.plot(peaks, np.linspace(0.0, 1.0, len(peaks)), color=_colour(i))
+        here = asdict(condition).items()
+        peaks = sorted(c["peak"] for c in report.contacts if here <= c.items())
+        axes.plot(peaks, np.linspace(0.0, 1.0, len(peaks)), **_line(report, i))
     axes.set(title="peak force of a contact: share below", xlabel="N")
 
 
 def _draw_ratios(axes: Axes, report: Report) -> None:
     axes.axvline(1.0, color="0.6", lw=0.8)
-    for c, comparison in enumerate(report.comparisons):
+    shown = [c for c in report.comparisons if report.conditions[c.baseline].u_on]
+    for c, comparison in enumerate(shown):
+        style = _line(report, comparison.condition)
         for line, name in enumerate(COMPARED):
             ratio = comparison.ratio[name]
             height = -line - 0.15 * c
-            axes.plot([ratio.low, ratio.high], [height] * 2, color=_colour(c + 1))
-            axes.plot(ratio.value, height, "o", color=_colour(c + 1), ms=4)
+            axes.plot([ratio.low, ratio.high], [height] * 2, **style)
+            axes.plot(ratio.value, height, "o", color=style["color"], ms=4)
     low, high = axes.get_xlim()
     axes.set_xlim(min(low, 0.9), max(high, 1.1))
     axes.set_yticks(-np.arange(len(COMPARED)), COMPARED, fontsize=8)
@@ -122,9 +141,10 @@ def _draw_ratios(axes: Axes, report: Report) -> None:
 def _draw_curve(axes: Axes, report: Report, name: str) -> None:
     for i, curves in enumerate(report.curves):
         time, mean, half = map(np.array, curves[name])
-        axes.plot(time, mean, color=_colour(i))
+        style = _line(report, i)
+        axes.plot(time, mean, **style)
         axes.fill_between(
-            time, mean - half, mean + half, color=_colour(i), alpha=0.2, lw=0.0
+            time, mean - half, mean + half, color=style["color"], alpha=0.2, lw=0.0
         )
     unit = dict(CURVES).get(name)
     since = report.clock or "since the reset"
@@ -146,13 +166,15 @@ def _name(report: Report, i: int) -> str:
     condition = report.conditions[i]
     several = len({c.run for c in report.conditions}) > 1
     run = f"{Path(condition.run).name} " if several else ""
-    return f"{run}alpha {condition.alpha:g}"
+    return f"{run}alpha {condition.alpha:g}{'' if condition.u_on else ', u off'}"
 
 
 def _versus(report: Report, comparison: Comparison) -> str:
     condition, baseline = (
         _name(report, i) for i in (comparison.condition, comparison.baseline)
     )
+    if baseline == f"{condition}, u off":
+        return f"{condition}: u on / u off"
     return f"{condition} / {baseline}"
 
 
@@ -173,5 +195,12 @@ def _text(interval: Interval) -> str:
     return f"{interval.value:.3g} [{interval.low:.3g}, {interval.high:.3g}]"
 
 
-def _colour(i: int) -> str:
-    return COLOURS[i % len(COLOURS)]
+def _line(report: Report, i: int) -> dict[str, Any]:
+    """Colour and dashes of a condition: a control arm has its level's colour."""
+    condition = report.conditions[i]
+    levels = [(c.run, c.alpha) for c in report.conditions if c.u_on]
+    place = levels.index((condition.run, condition.alpha))
+    return {
+        "color": COLOURS[place % len(COLOURS)],
+        "linestyle": "-" if condition.u_on else "--",
+    }

@@ -70,6 +70,7 @@ class Player:
         episodes: Sequence[int] | np.ndarray,
         alpha: Sequence[float] | np.ndarray,
         *,
+        observed_alpha: Sequence[float] | np.ndarray | None = None,
         seed: int = 0,
         seconds: float = 10.0,
         motion: bool = False,
@@ -78,15 +79,19 @@ class Player:
         """Plays episodes with the mean action.
 
         Args:
-            run: whose policy acts. It observes the nearest alpha it was trained with.
+            run: whose policy acts.
             episodes: number [N] of each; with the seed it decides on all that is drawn.
-            alpha: level of compliance [N] of each.
+            alpha: level of compliance [N] of each; at 0 u stays exactly zero.
+            observed_alpha: [N] that the policy observes; None: the level. It observes
+                the nearest alpha that it was trained with.
             seed: of everything that is drawn.
             seconds: after which an episode ends.
             motion: keep what pictures need.
             progress: told how many control steps are done, again and again.
         """
         episodes, alpha = np.asarray(episodes), np.asarray(alpha, np.float32)
+        told = alpha if observed_alpha is None else np.asarray(observed_alpha)
+        told = np.clip(told, *run.alphas).astype(np.float32)
         steps = max(1, round(seconds * CONTROL_RATE))
         width = self._width(len(episodes))
         parts = []
@@ -98,6 +103,7 @@ class Player:
                 run,
                 episodes[filled],
                 alpha[filled],
+                told[filled],
                 seed,
                 steps,
                 motion,
@@ -119,6 +125,7 @@ class Player:
         run: Run,
         episodes: np.ndarray,
         alpha: np.ndarray,
+        observed_alpha: np.ndarray,
         seed: int,
         steps: int,
         motion: bool,
@@ -126,7 +133,6 @@ class Player:
     ) -> dict[str, Any]:
         """Plays one batch until all its episodes are over; leaves [T or C, N, ...]."""
         keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(seed)))(episodes)
-        observed_alpha = np.clip(alpha, *run.alphas).astype(np.float32)
         split = NamedSharding(self._mesh, PartitionSpec("env"))
         keys, level, observed_alpha = jax.device_put(
             (keys, alpha, observed_alpha), split
