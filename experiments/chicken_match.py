@@ -3,9 +3,11 @@
 Both were trained against a box (`--task chicken-fight --env.mass 85`, and 36). Here
 they hop at each other until one falls. Left who wins, in the middle how far a bump
 drives either of them, right the sum of their momenta before and after it: what the
-floor does not take is conserved. Every level of compliance meets the same starts; bars
-are 95 % intervals. Beside the figure: FILE.csv, a row a bump, and FILE.json, what is
-drawn.
+floor does not take is conserved. That the light one is driven farther, in the ratio of
+the masses, is Newton's third law; an effect of compliance would be a difference between
+the arms. Hollow is the control arm: both policies observe alpha, and nothing is
+displaced. Every arm meets the same starts; bars are 95 % intervals. Beside the figure:
+FILE.csv, a row a bump, and FILE.json, what is drawn.
 
     python experiments/chicken_match.py HEAVY_RUN LIGHT_RUN [--alpha 0 0.16] [--video F]
 
@@ -17,9 +19,10 @@ a policy does at any mass what it does at its own (tests/tasks/test_chicken_figh
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -27,8 +30,11 @@ import paired
 
 from dcc_jax import runtime
 from dcc_jax.evaluate import bootstrap
+from dcc_jax.evaluate.bootstrap import Interval
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
     from dcc_jax.play.runs import Run
     from dcc_jax.tasks.match import Match
 
@@ -54,20 +60,30 @@ def weighing(run: Run, mass: float) -> Run:
     return replace(run, config=replace(run.config, env=env))
 
 
-def play(match: Match, runs: list[Run], level: float, count: int, steps: int, seed):
+def policy_actions(runs: list[Run], alpha: float) -> Callable[[Any], tuple]:
+    """The mean actions of both, each of which observes the nearest alpha it knows."""
+    from dcc_jax.env.observation import ALPHA_ENTRY
+
+    observed_alpha = [float(np.clip(alpha, *run.alphas)) for run in runs]
+
+    def act(sides):
+        return tuple(
+            run.policy.mean(side.obs.at[ALPHA_ENTRY].set(known))
+            for run, side, known in zip(runs, sides, observed_alpha, strict=True)
+        )
+
+    return act
+
+
+def play(
+    match: Match, runs: list[Run], arm: dict, count: int, steps: int, seed
+) -> Film:
     """Plays `count` matches with the mean actions."""
     import jax
     import jax.numpy as jnp
 
-    from dcc_jax.env.observation import ALPHA_ENTRY
-
-    observed_alpha = [float(np.clip(level, *run.alphas)) for run in runs]
-
-    def act(sides):
-        return tuple(
-            run.policy.mean(side.obs.at[ALPHA_ENTRY].set(alpha))
-            for run, side, alpha in zip(runs, sides, observed_alpha, strict=True)
-        )
+    act = policy_actions(runs, arm["alpha"])
+    level = jnp.full(2, arm["alpha"] if arm["u_on"] else 0.0)
 
     def step(sides, keys):
         sides = jax.vmap(lambda key, s: match.step(key, s, act(s)))(keys, sides)
@@ -80,7 +96,7 @@ def play(match: Match, runs: list[Run], level: float, count: int, steps: int, se
         return sides, shot
 
     reset_key, step_key = jax.random.split(jax.random.key(seed))
-    start = jax.jit(jax.vmap(lambda key: match.reset(key, jnp.full(2, level))))
+    start = jax.jit(jax.vmap(lambda key: match.reset(key, level)))
     sides = start(jax.random.split(reset_key, count))
     keys = jax.random.split(step_key, (steps, count))
     _, shots = jax.jit(lambda sides, keys: jax.lax.scan(step, sides, keys))(sides, keys)
@@ -150,125 +166,143 @@ def momenta(match: Match, film: Film, n: int, t: int) -> np.ndarray:
     return model.body_subtreemass[roots, None] * data.subtree_linvel[roots]
 
 
-def measured(level: float, results: np.ndarray, rows: list[dict]) -> list[dict]:
-    """Everything drawn at a level of compliance, with intervals."""
-    named = [
-        (f"wins_{name}", bootstrap.share(results == i))
+def measured(arm: dict, results: np.ndarray, rows: list[dict]) -> list[dict]:
+    """Everything drawn of an arm, with intervals."""
+    found = {
+        f"wins_{name}": bootstrap.share(results == i)
         for i, name in enumerate((*NAMES, "nobody"))
-    ]
+    }
     if rows:
-        # Bumps of a match are alike: whole matches are resampled, and a mean over
-        # bumps is the ratio of their sums and their numbers.
-        draws = bootstrap.draws(len(results))
-        value = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-        lost = value["momentum_after"] - value["momentum_before"]
+        found |= of_bumps(rows, len(results))
+    return [{**arm, "name": name, **asdict(x)} for name, x in found.items()]
 
-        def total(values: np.ndarray) -> np.ndarray:
-            return np.bincount(value["match"], values, minlength=len(results))
 
-        count, impulse = total(np.ones(len(rows))), total(value["impulse"])
-        heavy, light = total(-value["driven_heavy"]), total(value["driven_light"])
-        named += [
-            ("bumps", bootstrap.mean(count, draws)),
-            ("driven_heavy", bootstrap.ratio(heavy, count, draws)),
-            ("driven_light", bootstrap.ratio(light, count, draws)),
-            ("driven_light_to_heavy", bootstrap.ratio(light, heavy, draws)),
-            ("impulse", bootstrap.ratio(impulse, count, draws)),
-            ("momentum_change", bootstrap.ratio(total(lost), count, draws)),
-        ]
-    return [{"alpha": level, "name": name, **asdict(x)} for name, x in named]
+def of_bumps(rows: list[dict], matches: int) -> dict[str, Interval]:
+    """Means over the bumps of so many matches.
+
+    Bumps of a match are alike: whole matches are resampled, and a mean over bumps is
+    the ratio of their sums and their numbers.
+    """
+    draws = bootstrap.draws(matches)
+    match = paired.column(rows, "match")
+
+    def total(values: np.ndarray) -> np.ndarray:
+        return np.bincount(match, values, minlength=matches)
+
+    count = total(np.ones(len(rows)))
+    before, after = (paired.column(rows, f"momentum_{x}") for x in ("before", "after"))
+    sums = {
+        "driven_heavy": total(-paired.column(rows, "driven_heavy")),
+        "driven_light": total(paired.column(rows, "driven_light")),
+        "impulse": total(paired.column(rows, "impulse")),
+        "momentum_change": total(after - before),
+    }
+    return {
+        "bumps": bootstrap.mean(count, draws),
+        **{name: bootstrap.ratio(x, count, draws) for name, x in sums.items()},
+        "driven_light_to_heavy": bootstrap.ratio(
+            sums["driven_light"], sums["driven_heavy"], draws
+        ),
+    }
 
 
 def draw(points: list[dict], rows: list[dict], out: Path) -> None:
     """Wins, how far bumps drive, momenta."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, (wins, driven, momentum) = plt.subplots(1, 3, figsize=(13.5, 4))
-    for i, level in enumerate(dict.fromkeys(p["alpha"] for p in points)):
-        here = {p["name"]: p for p in points if p["alpha"] == level}
-        for place, names in (
-            (wins, ("wins_heavy", "wins_light", "wins_nobody")),
-            (driven, ("driven_heavy", "driven_light")),
-        ):
-            found = [here[name] for name in names if name in here]
-            if not found:
-                continue
-            value = [p["value"] for p in found]
-            bars = (
-                [p["value"] - p["low"] for p in found],
-                [p["high"] - p["value"] for p in found],
-            )
-            at = np.arange(len(found)) + 0.12 * i
-            place.errorbar(
-                at, value, bars, fmt="o", capsize=3, label=f"alpha {level:g}"
-            )
-            place.set_xticks(np.arange(len(found)), [n.split("_")[1] for n in names])
-        own = [row for row in rows if row["alpha"] == level]
-        momentum.plot(
-            [row["momentum_before"] for row in own],
-            [row["momentum_after"] for row in own],
-            ".",
-            alpha=0.5,
-        )
-    ends = np.array([*momentum.get_xlim(), *momentum.get_ylim()])
-    momentum.plot([ends.min(), ends.max()], [ends.min(), ends.max()], "0.5", lw=0.8)
+    figure, (wins, driven, momentum) = paired.panels([4.5, 4.5, 4.5], height=4.2)
+    _draw_bars(wins, points, [f"wins_{name}" for name in (*NAMES, "nobody")])
     wins.set(title="share of matches won", ylim=(0.0, 1.05))
-    driven.set(title=f"driven by a bump in {DRIVEN * DT:g} s (m)")
-    momentum.set(
-        title="momentum of both along a bump (N s)", xlabel="before", ylabel="after"
-    )
     wins.legend()
-    figure.tight_layout()
-    figure.savefig(out, dpi=120)
+    _draw_bars(driven, points, [f"driven_{name}" for name in NAMES])
+    driven.set(title=f"driven by a bump in {DRIVEN * DT:g} s (m)")
+    driven.set_ylim(bottom=0.0)
+    _draw_momenta(momentum, rows)
+    figure.savefig(out, dpi=100)
 
 
-def main() -> None:
+def _draw_bars(axes: Axes, points: list[dict], names: list[str]) -> None:
+    levels = [p["alpha"] for p in points]
+    for i, arm in enumerate(paired.arms_of(points)):
+        own = [p for p in points if arm.items() <= p.items() and p["name"] in names]
+        at = [names.index(p["name"]) + 0.12 * i for p in own]
+        face = {} if arm["u_on"] else {"markerfacecolor": "white"}
+        colour = paired.line(arm, levels)["color"]
+        style = {"color": colour, "linestyle": "none", "label": paired.label(arm)}
+        paired.errorbar(axes, at, own, **style, **face)
+    axes.set_xticks(range(len(names)), [name.split("_")[1] for name in names])
+
+
+def _draw_momenta(axes: Axes, rows: list[dict]) -> None:
+    """Before and after a bump, to the same scale, with what is conserved as a line."""
+    levels = [row["alpha"] for row in rows]
+    for arm in paired.arms_of(rows):
+        before, after = (
+            paired.column(rows, f"momentum_{x}", **arm) for x in ("before", "after")
+        )
+        face = {} if arm["u_on"] else {"markerfacecolor": "none"}
+        colour = paired.line(arm, levels)["color"]
+        axes.plot(before, after, ".", alpha=0.5, color=colour, **face)
+    axes.axline((0.0, 0.0), slope=1.0, color="0.5", lw=0.8)
+    axes.set(xlabel="before", ylabel="after", aspect="equal")
+    axes.set_title("momentum of both along a bump (N s)")
+
+
+def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     add = parser.add_argument
     add("heavy", type=Path, metavar="HEAVY_RUN")
     add("light", type=Path, metavar="LIGHT_RUN")
-    add("--alpha", type=float, nargs="+", default=[0.0, 0.16], metavar="A")
-    add("--matches", type=int, default=64, help="of each level (64)")
+    paired.add_shared(parser, "chicken_match", (0.0, 0.16))
+    add("--matches", type=int, default=64, help="of each arm (64)")
     add("--mass", type=float, nargs=2, metavar="KG", help="of the two (their own)")
     add("--seconds", type=float, default=20.0, help="of a match (20)")
     add("--distance", type=float, default=1.0, help="m between them at first (1.0)")
-    add("--seed", type=int, default=0)
-    add("--out", type=Path, default=Path("runs/chicken_match.png"), metavar="FILE.png")
     add("--video", type=Path, metavar="FILE.mp4", help="the first match, last level")
-    options = parser.parse_args()
-    runtime.setup()
+    return parser.parse_args()
+
+
+def prepared(options: argparse.Namespace) -> tuple[Match, list[Run]]:
+    """The match of the two runs, each with its mass."""
     from dcc_jax.play.runs import find_run, make_environment
     from dcc_jax.tasks.match import Match
-    from dcc_jax.viz import draw as pictures
 
     runs = [find_run(path) for path in (options.heavy, options.light)]
     if options.mass is not None:
         runs = [weighing(run, kg) for run, kg in zip(runs, options.mass, strict=True)]
     heavy, light = (make_environment(run) for run in runs)
-    match = Match(heavy, light, distance=options.distance)
-    rows, points, film = [], [], None
+    return Match(heavy, light, distance=options.distance), runs
+
+
+def film_match(match: Match, film: Film, out: Path) -> None:
+    """A video of the first match."""
+    from dcc_jax.viz import draw as pictures
+
+    images = pictures.frames(match.scene.model, film.qpos[:, 0], size=(640, 480))
+    pictures.write_mp4(out, images, fps=30)
+
+
+def main() -> None:
+    options = arguments()
+    runtime.setup()
+    match, runs = prepared(options)
+    rows, points = [], []
     steps = round(options.seconds / DT)
-    for level in options.alpha:
-        film = play(match, runs, level, options.matches, steps, options.seed)
+    for arm in paired.arms(options.alpha, options.control):
+        film = play(match, runs, arm, options.matches, steps, options.seed)
         found = [
-            row(match, film, n, *bump)
+            arm | row(match, film, n, *bump)
             for n in range(options.matches)
             for bump in bumps(film, n)
         ]
-        rows += [{"alpha": level, **r} for r in found]
-        points += measured(level, outcomes(film), found)
+        rows += found
+        points += measured(arm, outcomes(film), found)
+        if options.video is not None and arm == {
+            "alpha": options.alpha[-1],
+            "u_on": True,
+        }:
+            film_match(match, film, options.video)
     paired.write(options.out, rows, points)
     draw(points, rows, options.out)
-    for p in points:
-        interval = f"{p['value']:.3f} [{p['low']:.3f}, {p['high']:.3f}]"
-        print(f"alpha {p['alpha']:.2f}  {p['name']:22s} {interval}")
-    if options.video is not None and film is not None:
-        images = pictures.frames(match.scene.model, film.qpos[:, 0], size=(640, 480))
-        pictures.write_mp4(options.video, images, fps=30)
-    print(options.out)
+    paired.tell(points, options.out)
 
 
 if __name__ == "__main__":

@@ -2,9 +2,10 @@
 
 Left how high the lowest sole is, in the middle the character's total energy, both over
 the time since a bounce; bands are 95 % intervals. Right how low the feet go while the
-controller listens and what energy those contacts leave, of all episodes. Every level
-meets the same bounces. Beside the figure: FILE.csv, a row an episode, and FILE.json,
-what is drawn.
+compliance controller acts and what energy those contacts leave, of all episodes. Dashed
+is the control arm: the policy observes alpha, and nothing is displaced. Every arm meets
+the same bounces. Beside the figure: FILE.csv, a row an episode, and FILE.json, what is
+drawn.
 
     python experiments/fig5_trampoline.py [RUN_DIR...] [--alpha 0 0.16] [--out FILE.png]
 
@@ -24,6 +25,8 @@ import paired
 from dcc_jax import runtime
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
     from dcc_jax.evaluate.report import Report
 
 LEVELS = (0.0, 0.16)
@@ -37,7 +40,7 @@ BARS = {
 }
 
 
-def pooled(report: Report, name: str, level: float) -> dict:
+def pooled(report: Report, name: str, arm: dict) -> dict:
     """A curve over all runs: times, means, half widths of the intervals.
 
     Runs differ by more than their episodes: three or more are averaged as they are.
@@ -45,7 +48,7 @@ def pooled(report: Report, name: str, level: float) -> dict:
     curves = [
         np.array(curves[name])
         for condition, curves in zip(report.conditions, report.curves, strict=True)
-        if condition.alpha == level
+        if arm.items() <= asdict(condition).items()
     ]
     shortest = min(curve.shape[1] for curve in curves)
     time, mean, half = np.stack([c[:, :shortest] for c in curves], axis=1)
@@ -53,61 +56,64 @@ def pooled(report: Report, name: str, level: float) -> dict:
     within = np.sqrt(np.sum(half**2, axis=0)) / len(mean)
     return {
         "name": name,
-        "alpha": level,
+        **arm,
         "seconds": time[0].tolist(),
         "mean": mean.mean(axis=0).tolist(),
         "half": (between if len(mean) > 2 else within).tolist(),
     }
 
 
-def measured(report: Report, levels: list[float]) -> list[dict]:
-    """Everything drawn: curves by level, then means by level."""
-    points = [pooled(report, name, level) for name in CURVES for level in levels]
-    for name in BARS:
-        for level in levels:
-            found = paired.mean(report.rows, name, alpha=level)
-            points.append({"name": name, "alpha": level, **asdict(found)})
-    return points
+def measured(report: Report) -> list[dict]:
+    """Everything drawn: curves by arm, then means by arm."""
+    arms = paired.arms_of(report.rows)
+    return [pooled(report, name, arm) for name in CURVES for arm in arms] + [
+        {"name": name, **arm, **asdict(paired.mean(report.rows, name, **arm))}
+        for name in BARS
+        for arm in arms
+    ]
 
 
 def draw(points: list[dict], out: Path) -> None:
     """Two curves and two bars."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    widths = [2.0] * len(CURVES) + [1.0] * len(BARS)
-    figure, axes = plt.subplots(
-        1, len(widths), figsize=(15, 3.8), gridspec_kw={"width_ratios": widths}
-    )
+    widths = [5.0] * len(CURVES) + [3.0] * len(BARS)
+    figure, axes = paired.panels(widths)
     for place, (name, title) in zip(axes, (CURVES | BARS).items(), strict=True):
-        for p in (p for p in points if p["name"] == name):
-            if name in CURVES:
-                label = f"alpha = {p['alpha']:g}"
-                time, mean, half = (np.array(p[k]) for k in ("seconds", "mean", "half"))
-                place.plot(time, mean, label=label)
-                place.fill_between(time, mean - half, mean + half, alpha=0.2, lw=0.0)
-                continue
-            bars = [[p["value"] - p["low"]], [p["high"] - p["value"]]]
-            place.errorbar(
-                [f"{p['alpha']:g}"], [p["value"]], bars, marker="o", capsize=3
-            )
+        here = [p for p in points if p["name"] == name]
+        (_draw_curves if name in CURVES else _draw_bars)(place, here)
         place.set_title(title, fontsize=10)
         place.grid(alpha=0.3)
-        place.set_xlabel("s since the bounce" if name in CURVES else "alpha")
     axes[0].legend()
-    figure.tight_layout()
     figure.savefig(out, dpi=120)
 
 
+def _draw_curves(axes: Axes, points: list[dict]) -> None:
+    for p in points:
+        style = paired.line(p, [q["alpha"] for q in points])
+        time, mean, half = (np.array(p[k]) for k in ("seconds", "mean", "half"))
+        axes.plot(time, mean, label=paired.label(p), **style)
+        band = {"color": style["color"], "alpha": 0.2, "lw": 0.0}
+        axes.fill_between(time, mean - half, mean + half, **band)
+    axes.set_xlabel("s since the bounce")
+
+
+def _draw_bars(axes: Axes, points: list[dict]) -> None:
+    for p in points:
+        colour = paired.line(p, [q["alpha"] for q in points])["color"]
+        face = {} if p["u_on"] else {"markerfacecolor": "white"}
+        name = paired.label(p).replace(", ", "\n")
+        paired.errorbar(axes, [name], [p], color=colour, **face)
+    axes.margins(x=0.3)
+
+
 def main() -> None:
-    options = paired.parser(__doc__, "fig5_trampoline", LEVELS)
+    options = paired.parser(__doc__, "fig5_trampoline", LEVELS).parse_args()
     runtime.setup()
-    report = paired.evaluated(options, "trampoline", Path("runs/fig5_trampoline"))
-    points = measured(report, options.alpha)
-    paired.write(options.out, report.rows, points)
+    report = paired.evaluated(options, paired.policies(options, "trampoline"))
+    points = measured(report)
+    effects = [p for name in BARS for p in paired.effects(report.rows, name)]
+    paired.write(options.out, report.rows, points + effects)
     draw(points, options.out)
+    paired.tell_effects(effects)
     paired.tell([p for p in points if p["name"] in BARS], options.out)
 
 

@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from dcc_jax.control import compliance
 from dcc_jax.env.observation import ALPHA_ENTRY
-from dcc_jax.evaluate import report
+from dcc_jax.evaluate import report, show
 from dcc_jax.play import runs
 from dcc_jax.play.player import Player
 from dcc_jax.play.recording import Recording
@@ -36,7 +37,7 @@ def push(smoke_run: Callable[[str], Path]) -> Path:
 
 @pytest.fixture(scope="module")
 def plan(push: Path) -> report.EvaluationPlan:
-    """Two levels of compliance of one policy; its program serves the whole file."""
+    """Two levels of one policy and a control arm; its program serves the file."""
     return report.prepare(push, EPISODES, None, 3, SECONDS, None, lambda text: None)
 
 
@@ -51,12 +52,21 @@ def _trained_at(run: runs.Run, alpha: float) -> runs.Run:
     return dataclasses.replace(run, config=dataclasses.replace(run.config, env=env))
 
 
-def _play(plan: report.EvaluationPlan, alpha: float) -> Recording:
+def _play(
+    plan: report.EvaluationPlan, alpha: float, observed: float = 0.16, sense: float = 1
+) -> Recording:
+    """Episodes of a policy whose weights of alpha are `sense` times its own."""
     run, _ = plan.conditions[0]
+    first, *rest = run.policy.params.layers
+    kernel = jnp.asarray(first.kernel).at[ALPHA_ENTRY].multiply(sense)
+    layers = (dataclasses.replace(first, kernel=kernel), *rest)
+    params = dataclasses.replace(run.policy.params, layers=layers)
+    policy = dataclasses.replace(run.policy, params=params)
     return plan.players[run.name].play(
-        _trained_at(run, 0.16),
+        dataclasses.replace(run, policy=policy),
         range(EPISODES),
         [alpha] * EPISODES,
+        observed_alpha=[observed] * EPISODES,
         seed=3,
         seconds=SECONDS,
         motion=True,
@@ -79,8 +89,25 @@ def test_levels_of_compliance_meet_the_same_balls(recordings):
     np.testing.assert_array_equal(rigid[untouched], yielding[untouched])
     hit = forces[0] & recordings[0].alive & recordings[1].alive
     assert np.abs(rigid[hit] - yielding[hit]).max() > 1e-5
-    assert recordings[0].numbers["displacement"].max() < 1e-5
     assert recordings[1].numbers["displacement"][hit].max() > 1e-4
+
+
+def test_u_is_exactly_zero_in_the_control_arm(plan, recordings):
+    control, compliant = recordings
+    (environment,) = {player.environment for player in plan.players.values()}
+    rest = compliance.at_rest(environment.kinematics.coords).u
+    u = control.motion.u[control.alive]
+    np.testing.assert_array_equal(u, np.broadcast_to(rest, u.shape))
+    assert np.abs(compliant.motion.u[compliant.alive] - rest).max() > 1e-4
+    for name in ("displacement", "root_displacement"):
+        assert control.numbers[name][control.alive].max() == 0.0
+
+
+def test_control_arm_is_alpha_zero_for_a_policy_that_ignores_alpha(plan):
+    """And is not for one that heeds it: alpha enters nothing but u and what is seen."""
+    for sense, same in ((0.0, True), (3.0, False)):
+        told, baseline = (_play(plan, 0.0, x, sense).motion.qpos for x in (0.16, 0.0))
+        assert np.array_equal(told, baseline) == same
 
 
 def test_episodes_differ_and_depend_on_the_seed_alone(plan, recordings):
@@ -119,7 +146,7 @@ def test_impulse_of_a_contact_is_what_the_ball_lost(plan, recordings):
     np.testing.assert_allclose(np.median(impulse / lost), 1.0, atol=0.1)
 
 
-def test_same_policy_under_two_names_gives_the_same_rows(push, tmp_path):
+def test_same_policy_under_two_names_gives_the_same_rows(plan, push, tmp_path):
     other = tmp_path / "other"
     other.mkdir()
     for name in ("policy.npz", "config.json"):
@@ -129,25 +156,70 @@ def test_same_policy_under_two_names_gives_the_same_rows(push, tmp_path):
     )
     assert len({id(player) for player in twice.players.values()}) == 1
     assert [run.name for run, _ in twice.conditions] == [str(push), str(other)]
+    # The same environment, whose program is there already.
+    (player,) = plan.players.values()
+    shared = dataclasses.replace(twice, players=dict.fromkeys(twice.players, player))
+    both = report.execute(shared, lambda done, total: None)
+    mine, theirs = both.rows[:EPISODES], both.rows[EPISODES:]
+    for one, another in zip(mine, theirs, strict=True):
+        assert (one["run"], another["run"]) == (str(push), str(other))
+        np.testing.assert_equal(one | {"run": ""}, another | {"run": ""})
+    (comparison,) = both.comparisons
+    assert comparison.ratio["torque/rms"].value == 1.0
+    assert {x.value for x in comparison.difference.values()} <= {0.0} | {np.nan}
 
 
-def test_report_has_a_row_an_episode_and_a_comparison_of_the_levels(found):
-    assert [c.alpha for c in found.conditions] == [0.0, 0.16]
-    assert len(found.rows) == 2 * EPISODES
-    assert {row["episode"] for row in found.rows} == set(range(EPISODES))
-    (comparison,) = found.comparisons
-    assert (comparison.condition, comparison.baseline) == (1, 0)
-    peaks = [row["contact/peak"] for row in found.rows]
-    for i, part in enumerate(np.split(np.array(peaks), 2)):
+def test_report_has_a_row_an_episode_and_its_arm(found):
+    arms = [(c.alpha, c.u_on) for c in found.conditions]
+    assert arms == [(0.0, True), (0.16, True), (0.16, False)]
+    episodes = [(row["alpha"], row["u_on"], row["episode"]) for row in found.rows]
+    assert episodes == [(*arm, n) for arm in arms for n in range(EPISODES)]
+    moved = [found.summary[i]["u/joints_max"].value for i in range(3)]
+    assert moved[0] == moved[2] == 0.0 < moved[1]
+    assert all(("u_on" in c and c["peak"] > 0.0) for c in found.contacts)
+    assert found.clock == "since_throw"
+    assert "task/speed/mean" in found.rows[0]
+
+
+def test_summary_is_of_the_rows(found):
+    peaks = np.array([row["contact/peak"] for row in found.rows])
+    for i, part in enumerate(np.split(peaks, 3)):
         mean = found.summary[i]["contact/peak"]
         assert mean.value == pytest.approx(np.nanmean(part))
-        assert mean.low <= mean.value <= mean.high
+        assert np.nanmin(part) <= mean.low < mean.value < mean.high <= np.nanmax(part)
     listed = [c["peak"] for c in found.contacts if c["alpha"] == 0.0]
     assert found.summary[0]["contact/peak_max"].value == max(listed)
     assert found.summary[0]["broken"].value == 0.0
     assert found.summary[0]["style/frechet"].value > 0.0
-    assert found.clock == "since_throw"
-    assert "task/speed/mean" in found.rows[0]
+
+
+def test_effect_of_compliance_is_the_difference_of_the_differences(found):
+    level, control, effect = found.comparisons
+    for comparison, pair in ((level, (1, 0)), (control, (2, 0)), (effect, (1, 2))):
+        assert (comparison.condition, comparison.baseline) == pair
+    for name in ("torque/rms", "energy", "u/joints"):
+        of = [c.difference[name].value for c in (level, control, effect)]
+        assert of[2] == pytest.approx(of[0] - of[1], abs=1e-9)
+    assert effect.difference["u/joints"].value > 0.0
+
+
+def test_control_arms_are_played_where_levels_are_compared(push):
+    run = runs.find_run(push)
+
+    def played(levels: list[float], control: bool) -> list[tuple[float, bool, float]]:
+        found = report._conditions([(run, levels)], control)
+        return [(c.alpha, c.u_on, c.level) for _, c in found]
+
+    three = [(0.0, True, 0.0), (0.16, True, 0.16), (0.16, False, 0.0)]
+    assert played([0.0, 0.16], True) == three
+    assert played([0.0, 0.16], False) == three[:2]
+    assert played([0.16], True) == three[1:2]
+
+
+def test_control_arm_is_drawn_in_its_levels_colour_and_dashed(found):
+    level, control = (show._line(found, i) for i in (1, 2))
+    assert control == level | {"linestyle": "--"}
+    assert show._line(found, 0)["color"] != level["color"]
 
 
 def test_json_and_figure_are_written_and_the_table_is_printed(
@@ -159,10 +231,13 @@ def test_json_and_figure_are_written_and_the_table_is_printed(
     argv = ["RUN", "--json", str(paths["a.json"]), "--figure", str(paths["a.png"])]
     assert command.main(argv) == 0
     text = capsys.readouterr().out
-    for part in ("alpha 0.16 / alpha 0", "contact/peak (N)", "survived (s)"):
-        assert part in text
+    level, control = "alpha 0.16 / alpha 0", "alpha 0.16, u off / alpha 0"
+    for part in (level, control, "alpha 0.16: u on / u off"):
+        assert text.count(part) == 1
+    assert text.count("contact/peak (N)") == text.count("survived (s)") == 2
+    assert text.count("contact/peak_max (N)") == 1
     data = json.loads(paths["a.json"].read_text(), parse_constant=pytest.fail)
-    assert len(data["rows"]) == 2 * EPISODES
+    assert [row["u_on"] for row in data["rows"]].count(False) == EPISODES
     assert data["summary"][0]["fell"].keys() == {"value", "low", "high"}
     picture = imread(paths["a.png"])
     assert picture.shape[0] > 500 and picture[..., :3].std() > 0.05

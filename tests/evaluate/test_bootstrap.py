@@ -47,6 +47,21 @@ def test_pair_with_one_half_missing_does_not_count():
     assert bootstrap.ratio(values, baseline, bootstrap.draws(3)).value == 2.0
 
 
+@pytest.mark.parametrize("seen", [0, 1, 7, 63, 64])
+def test_interval_of_a_share_is_wilsons(seen):
+    """Its ends are the shares p that lie z standard errors sqrt(p (1 - p) / n) away."""
+    n, z = 64, 1.959964
+    share = bootstrap.share(np.arange(n) < seen)
+    assert share.value == seen / n
+    for p, never in ((share.low, seen == 0), (share.high, seen == n)):
+        if never:
+            assert p == share.value
+        else:
+            away = abs(p - share.value)
+            assert away == pytest.approx(z * np.sqrt(p * (1.0 - p) / n), rel=1e-6)
+    assert share.low <= share.value <= share.high
+
+
 @pytest.mark.parametrize("n", [10, 127, 128, 256])
 def test_share_lies_in_its_interval_also_where_all_or_none_are_true(n):
     for value in (0.0, 1.0):

@@ -1,0 +1,133 @@
+"""The figures of `experiments`: what is drawn and told, from rows made by hand."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+from dataclasses import asdict
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from dcc_jax.evaluate.compare import Condition
+
+ROOT = Path(__file__).resolve().parents[1]
+ARMS = [Condition("a", 0.0), Condition("a", 0.16), Condition("a", 0.16, u_on=False)]
+
+
+@pytest.fixture(autouse=True)
+def _found(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "experiments")
+
+
+def _rows(**metrics: tuple[float, float, float]) -> list[dict]:
+    """Eight episodes; a metric has a value an arm, and the episode number on top."""
+    return [
+        {**asdict(arm), "episode": n, **{k: v[i] + n for k, v in metrics.items()}}
+        for i, arm in enumerate(ARMS)
+        for n in range(8)
+    ]
+
+
+def test_effects_are_of_u_of_being_told_and_of_compliance_alone():
+    paired = importlib.import_module("paired")
+    found = paired.effects(_rows(force=(10.0, 9.0, 8.5)), "force")
+    values = {p["effect"]: p["value"] for p in found}
+    assert values == {"with u": -1.0, "told alpha, u off": -1.5, "compliance": 0.5}
+    assert all(p["low"] == p["value"] == p["high"] for p in found)
+
+
+def test_arms_are_those_that_an_evaluation_plays():
+    paired = importlib.import_module("paired")
+    known = [{"alpha": c.alpha, "u_on": c.u_on} for c in ARMS]
+    assert paired.arms((0.0, 0.16), control=True) == known
+    assert paired.arms((0.0, 0.16), control=False) == known[:2]
+    assert paired.arms_of(_rows()) == known
+
+
+@pytest.mark.parametrize("name", ["fig4_levels", "fig5_trampoline", "fig6_door"])
+def test_control_arm_is_played_and_can_be_left_out(name):
+    paired = importlib.import_module("paired")
+    options = paired.parser("What.", name, (0.0, 0.16))
+    assert options.parse_args(["push"]).control
+    assert not options.parse_args(["push", "--no-control"]).control
+
+
+def test_ratios_of_figure_4_have_the_control_arm(tmp_path):
+    fig4 = importlib.import_module("fig4_levels")
+    names = dict.fromkeys([*fig4.RATIOS, "range"], (10.0, 5.0, 10.0))
+    rows = [row | {"fell": row["episode"] < 2} for row in _rows(**names)]
+    points = fig4.measured(rows)
+    ratios = {
+        (p["alpha"], p["u_on"]): p["value"]
+        for p in points
+        if p["name"] == "contact/peak" and p["run"] is None
+    }
+    assert ratios[0.0, True] == ratios[0.16, False] == 1.0 != ratios[0.16, True]
+    assert {p["value"] for p in points if p["name"] == "fell"} == {0.25}
+    fig4.draw(points, tmp_path / "a.png")
+    assert imread(tmp_path / "a.png")[..., :3].std() > 0.05
+
+
+def test_curves_of_figure_5_are_of_every_arm(tmp_path):
+    fig5 = importlib.import_module("fig5_trampoline")
+    curve = [[0.0, 0.1], [1.0, 2.0], [0.1, 0.1]]
+    report = SimpleNamespace(
+        conditions=ARMS,
+        curves=[
+            {name: (np.array(curve) + i).tolist() for name in fig5.CURVES}
+            for i, _ in enumerate(ARMS)
+        ],
+        rows=_rows(**dict.fromkeys(fig5.BARS, (1.0, 2.0, 3.0))),
+    )
+    points = fig5.measured(report)
+    means = [p["mean"] for p in points if p["name"] == "energy"]
+    assert means == [[1.0, 2.0], [2.0, 3.0], [3.0, 4.0]]
+    fig5.draw(points, tmp_path / "a.png")
+    assert imread(tmp_path / "a.png")[..., :3].std() > 0.05
+
+
+def test_figure_6_compares_the_arms_at_every_width(tmp_path, monkeypatch):
+    fig6 = importlib.import_module("fig6_door")
+    names = dict.fromkeys(fig6.PANELS, (10.0, 9.0, 8.0))
+    rows = [row | {fig6.OPEN: row["episode"] < 4} for row in _rows(**names)]
+    report = SimpleNamespace(rows=rows)
+    asked = []
+
+    def evaluated(options, runs, task):
+        asked.append(task.width)
+        return report
+
+    monkeypatch.setattr(fig6.paired, "evaluated", evaluated)
+    options = argparse.Namespace(runs=[Path("door")], widths=[1.0, 1.5])
+    points = fig6.measured(fig6.measure(options))
+    assert asked == [1.0, 1.5]
+    assert len(points) == 2 * len(fig6.PANELS) * len(ARMS)
+    assert {p["value"] for p in points if p["name"] == fig6.OPEN} == {0.5}
+    fig6.draw(points, tmp_path / "a.png")
+    assert imread(tmp_path / "a.png")[..., :3].std() > 0.05
+
+
+def test_momenta_of_a_match_are_drawn_to_one_scale(tmp_path):
+    match = importlib.import_module("chicken_match")
+    rows = [
+        {**arm, "match": n, "impulse": 9.0, "driven_heavy": -0.03, "driven_light": 0.08}
+        | {"momentum_before": 10.0 + n, "momentum_after": 9.0 + n}
+        for arm in match.paired.arms((0.0, 0.16), control=True)
+        for n in range(8)
+    ]
+    points = []
+    for arm in match.paired.arms_of(rows):
+        own = [row for row in rows if arm.items() <= row.items()]
+        points += match.measured(arm, np.repeat([0, 2], 4), own)
+    value = {p["name"]: p["value"] for p in points}
+    assert value["wins_heavy"] == 0.5 and value["momentum_change"] == -1.0
+    assert value["driven_light_to_heavy"] == pytest.approx(0.08 / 0.03)
+    _, axes = match.paired.panels([4.0])
+    match._draw_momenta(axes, rows)
+    assert axes.get_aspect() == 1.0
+    match.draw(points, rows, tmp_path / "a.png")
+    assert imread(tmp_path / "a.png")[..., :3].std() > 0.05
