@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from dcc_jax.evaluate.compare import Condition
+from dcc_jax.evaluate import bootstrap, compare
+from dcc_jax.evaluate.compare import Condition, Part
 
 ROOT = Path(__file__).resolve().parents[1]
 ARMS = [Condition("a", 0.0), Condition("a", 0.16), Condition("a", 0.16, u_on=False)]
@@ -131,3 +132,39 @@ def test_momenta_of_a_match_are_drawn_to_one_scale(tmp_path):
     assert axes.get_aspect() == 1.0
     match.draw(points, rows, tmp_path / "a.png")
     assert imread(tmp_path / "a.png")[..., :3].std() > 0.05
+
+
+def test_table_has_the_arms_and_what_compliance_alone_does():
+    table = importlib.import_module("control_table")
+    rows = _rows(force=(10.0, 9.0, 8.5))
+    parts = [
+        Part(
+            arm,
+            [{"force": r["force"]} for r in rows[8 * i : 8 * i + 8]],
+            [],
+            {},
+            {},
+            [],
+        )
+        for i, arm in enumerate(ARMS)
+    ]
+    draws = bootstrap.draws(8)
+    report = {
+        "conditions": [asdict(arm) for arm in ARMS],
+        "rows": rows,
+        "summary": [
+            {"force": asdict(bootstrap.mean(np.full(8, x), draws))}
+            for x in (10.0, 9.0, 8.5)
+        ],
+        "comparisons": [asdict(c) for c in compare.comparisons(parts, draws)],
+    }
+    lines = (table.Line("force", "force (mN)", 1e3, 0), table.Line("none", "nothing"))
+    head, _, row = table.table(report, lines).splitlines()
+    assert head.split(" | ")[3:] == [
+        "alpha 0.16, u off",
+        "alpha 0.16 less alpha 0",
+        "alpha 0.16, u off less alpha 0",
+        "u on less u off |",
+    ]
+    values = [cell.split()[0] for cell in row.split(" | ")[1:]]
+    assert values == ["10000", "9000", "8500", "-1000", "-1500", "+500"]
