@@ -11,7 +11,7 @@ FILE.csv, a row a bump, and FILE.json, what is drawn.
 
     python experiments/chicken_match.py HEAVY_RUN LIGHT_RUN [--alpha 0 0.16] [--video F]
 
-With `--mass 85 36` the two have these masses, whatever they were trained with: masses,
+`--mass 85 36` gives the two these masses, whatever they were trained with: masses,
 inertias, gains, torque limits and the box all scale with the character's mass, so that
 a policy does at any mass what it does at its own (tests/tasks/test_chicken_fight.py).
 """
@@ -133,7 +133,9 @@ def row(match: Match, film: Film, n: int, begin: int, end: int) -> dict:
     for i, side in enumerate(match.sides):
         adr = side.scene.qpos_adr
         root = film.qpos[:, n, adr : adr + 2] @ way
-        drift = momenta(match, film, n, begin - 1)[i, :2] @ way / mass(match, i)
+        drift = (
+            momenta(match, film, n, begin - 1)[i, :2] @ way / side.scene.character.mass
+        )
         driven = root[begin - 1 + DRIVEN] - root[begin - 1] - drift * DT * DRIVEN
         moved[f"driven_{NAMES[i]}"] = float(driven)
     return {
@@ -144,10 +146,6 @@ def row(match: Match, film: Film, n: int, begin: int, end: int) -> dict:
         "momentum_before": float(before.sum()),
         "momentum_after": float(after.sum()),
     }
-
-
-def mass(match: Match, i: int) -> float:
-    return match.sides[i].scene.character.mass
 
 
 def momenta(match: Match, film: Film, n: int, t: int) -> np.ndarray:
@@ -247,7 +245,7 @@ def _draw_momenta(axes: Axes, rows: list[dict]) -> None:
 
 
 def arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     add = parser.add_argument
     add("heavy", type=Path, metavar="HEAVY_RUN")
     add("light", type=Path, metavar="LIGHT_RUN")
@@ -272,17 +270,11 @@ def prepared(options: argparse.Namespace) -> tuple[Match, list[Run]]:
     return Match(heavy, light, distance=options.distance), runs
 
 
-def film_match(match: Match, film: Film, out: Path) -> None:
-    """A video of the first match."""
-    from dcc_jax.viz import draw as pictures
-
-    images = pictures.frames(match.scene.model, film.qpos[:, 0], size=(640, 480))
-    pictures.write_mp4(out, images, fps=30)
-
-
 def main() -> None:
     options = arguments()
     runtime.setup()
+    from dcc_jax.viz import draw as pictures
+
     match, runs = prepared(options)
     rows, points = [], []
     steps = round(options.seconds / DT)
@@ -295,11 +287,11 @@ def main() -> None:
         ]
         rows += found
         points += measured(arm, outcomes(film), found)
-        if options.video is not None and arm == {
-            "alpha": options.alpha[-1],
-            "u_on": True,
-        }:
-            film_match(match, film, options.video)
+        if options.video and arm == {"alpha": options.alpha[-1], "u_on": True}:
+            images = pictures.frames(
+                match.scene.model, film.qpos[:, 0], size=(640, 480)
+            )
+            pictures.write_mp4(options.video, images, fps=30)
     paired.write(options.out, rows, points)
     draw(points, rows, options.out)
     paired.tell(points, options.out)

@@ -86,7 +86,7 @@ def _draw_metric(axes: Axes, points: list[dict]) -> None:
 
 
 def main() -> None:
-    options = paired.parser(__doc__, "fig4_levels", LEVELS).parse_args()
+    options = paired.parser(__doc__ or "", "fig4_levels", LEVELS).parse_args()
     runtime.setup()
     report = paired.evaluated(options, paired.policies(options, "push"))
     points = measured(report.rows)

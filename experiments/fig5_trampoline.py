@@ -106,7 +106,7 @@ def _draw_bars(axes: Axes, points: list[dict]) -> None:
 
 
 def main() -> None:
-    options = paired.parser(__doc__, "fig5_trampoline", LEVELS).parse_args()
+    options = paired.parser(__doc__ or "", "fig5_trampoline", LEVELS).parse_args()
     runtime.setup()
     report = paired.evaluated(options, paired.policies(options, "trampoline"))
     points = measured(report)

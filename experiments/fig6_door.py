@@ -87,7 +87,7 @@ def _draw_lines(axes: Axes, points: list[dict]) -> None:
 
 
 def main() -> None:
-    parser = paired.parser(__doc__, "fig6_door", LEVELS)
+    parser = paired.parser(__doc__ or "", "fig6_door", LEVELS)
     widths = [round(1.0 + 0.1 * i, 1) for i in range(8)]
     parser.add_argument("--widths", type=float, nargs="+", default=widths)
     options = parser.parse_args()
