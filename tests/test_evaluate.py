@@ -27,6 +27,7 @@ from dcc_jax.tasks.push import Push
 command = importlib.import_module("dcc_jax.evaluate.__main__")
 
 EPISODES, SECONDS, GRAVITY = 8, 1.5, 9.81
+U_FLOOR = 1.01e-6  # what the norm of u = 0 is, so that it has a derivative
 Seen = tuple[Player, Recording, report.Report]
 
 
@@ -100,7 +101,7 @@ def test_u_is_exactly_zero_in_the_control_arm(plan, recordings):
     np.testing.assert_array_equal(u, np.broadcast_to(rest, u.shape))
     assert np.abs(compliant.motion.u[compliant.alive] - rest).max() > 1e-4
     for name in ("displacement", "root_displacement"):
-        assert control.numbers[name][control.alive].max() == 0.0
+        assert control.numbers[name][control.alive].max() <= U_FLOOR
 
 
 def test_control_arm_is_alpha_zero_for_a_policy_that_ignores_alpha(plan):
@@ -175,7 +176,7 @@ def test_report_has_a_row_an_episode_and_its_arm(found):
     episodes = [(row["alpha"], row["u_on"], row["episode"]) for row in found.rows]
     assert episodes == [(*arm, n) for arm in arms for n in range(EPISODES)]
     moved = [found.summary[i]["u/joints_max"].value for i in range(3)]
-    assert moved[0] == moved[2] == 0.0 < moved[1]
+    assert moved[0] == moved[2] <= U_FLOOR < 0.1 * moved[1]
     assert all(("u_on" in c and c["peak"] > 0.0) for c in found.contacts)
     assert found.clock == "since_throw"
     assert "task/speed/mean" in found.rows[0]
