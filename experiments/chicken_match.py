@@ -62,7 +62,7 @@ def weighing(run: Run, mass: float) -> Run:
 
 def policy_actions(runs: list[Run], alpha: float) -> Callable[[Any], tuple]:
     """The mean actions of both, each of which observes the nearest alpha it knows."""
-    from dcc_jax.env.environment import ALPHA_ENTRY
+    from dcc_jax.env.observation import ALPHA_ENTRY
 
     observed_alpha = [float(np.clip(alpha, *run.alphas)) for run in runs]
 

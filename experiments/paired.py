@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import dcc_jax
-from dcc_jax.evaluate import bootstrap
+from dcc_jax.evaluate import bootstrap, compare
 from dcc_jax.evaluate.bootstrap import Interval
 
 if TYPE_CHECKING:
@@ -144,9 +144,7 @@ def column(rows: list[Row], name: str, **where: object) -> np.ndarray:
 def mean(rows: list[Row], name: str, **where: object) -> Interval:
     """Mean of a metric over episodes, or the share of one that is true or false."""
     values = column(rows, name, **where)
-    if name in ("fell", "task/open/final"):
-        return bootstrap.share(values)
-    return bootstrap.mean(values, bootstrap.draws(len(values)))
+    return compare.mean_or_share(name, values, bootstrap.draws(len(values)))
 
 
 def ratio(

@@ -123,7 +123,7 @@ def test_each_equation_is_on_the_map_and_is_found_by_one_grep_at_its_code():
     rows = EQUATION.findall(MAP)
     assert [int(number) for number, _, _ in rows] == list(range(1, EQUATIONS + 1))
     for number, code, test in rows:
-        cited = re.compile(rf"Eq\. .*\b{number}\b")
+        cited = re.compile(rf"Eq\. \({number}\)")
         places = PLACE.findall(code)
         assert places and all(cited.search(home(p).read_text()) for p, _ in places)
         assert any(path.startswith("tests/") for path, _ in PLACE.findall(test))

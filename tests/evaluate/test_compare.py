@@ -59,3 +59,13 @@ def test_arms_of_runs_with_one_level_each_are_compared_with_the_first_of_all():
 def test_each_of_several_runs_has_its_own_baseline():
     arms = [RIGID, TOLD, Condition("b", 0.0), Condition("b", 0.16)]
     assert compare.paired(arms) == [(1, 0), (3, 2)]
+
+
+def test_what_is_so_at_the_end_or_not_is_a_share():
+    opened, draws = np.ones(64), bootstrap.draws(64)
+    share = bootstrap.share(opened)
+    assert share.low < 0.95
+    for name in ("fell", "task/open/final"):
+        assert compare.mean_or_share(name, opened, draws) == share
+    for name, values in (("task/angle/final", 1.2 * opened), ("r_p", opened)):
+        assert compare.mean_or_share(name, values, draws).low == values[0]

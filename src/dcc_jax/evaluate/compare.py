@@ -97,10 +97,7 @@ def summary(part: Part, resamples: np.ndarray) -> dict[str, Interval]:
     """
     columns = {name: _column(part, name) for name in part.rows[0]}
     found = {
-        name: bootstrap.share(values)
-        if name == "fell"
-        else bootstrap.mean(values, resamples)
-        for name, values in columns.items()
+        name: mean_or_share(name, values, resamples) for name, values in columns.items()
     }
     peaks = [(c["peak"], n) for n, cs in enumerate(part.contacts) for c in cs]
     values, episode = np.array(peaks).reshape(-1, 2).T
@@ -110,6 +107,17 @@ def summary(part: Part, resamples: np.ndarray) -> dict[str, Interval]:
     )
     found["contact/peak_max"] = Interval(values.max(initial=0.0), *nothing)
     return found | {k: Interval(v, *nothing) for k, v in part.pooled.items()}
+
+
+def mean_or_share(name: str, values: np.ndarray, resamples: np.ndarray) -> Interval:
+    """A share where a metric [N] says of each episode whether something was so.
+
+    That are `fell` and what a task has as yes or no at the end, such as an open door.
+    """
+    yes_or_no = name == "fell" or name.endswith("/final")
+    if yes_or_no and np.isin(values, (0.0, 1.0)).all():
+        return bootstrap.share(values)
+    return bootstrap.mean(values, resamples)
 
 
 def _compared(
