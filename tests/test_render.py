@@ -17,7 +17,7 @@ from dcc_jax import quat
 from dcc_jax.config import make_config
 from dcc_jax.play.recording import Motion, displaced
 from dcc_jax.render import film
-from dcc_jax.tasks import make_environment
+from dcc_jax.training.loop import make_environment
 from dcc_jax.viz import draw
 
 # The package shows the function of that name; these tests want the module.

@@ -15,9 +15,9 @@ from dcc_jax.motion.formats.deepmimic import read_deepmimic
 from dcc_jax.motion.formats.npz import MotionError
 from dcc_jax.motion.formats.skeleton import CMU_UNIT, Motion
 from dcc_jax.motion.frames import to_rotation
+from dcc_jax.motion.retarget import retarget
 from dcc_jax.motion.retarget.figure import figure, world_of
 from dcc_jax.motion.retarget.importer import Options, import_motion, read_motion
-from dcc_jax.motion.retarget.retarget import retarget
 
 real = pytest.mark.skipif(not files.MOTIONS.is_dir(), reason="no motion data here")
 CMU, HDM = files.MOTIONS / "cmu_asfamc", files.MOTIONS / "hdm05_asfamc"

@@ -246,7 +246,7 @@ def test_the_reference_hops_slowly_where_it_likes(scene, reference):
 
     def wander(key):
         state, _, _ = TASK.reset(key, scene, reference)
-        return chicken_fight.partner.path(state.motion, jnp.zeros(()))
+        return chicken_fight.paths.path(state.motion, jnp.zeros(()))
 
     position, heading, speed = jax.jit(jax.vmap(wander))(keys)
     np.testing.assert_allclose(position, np.tile(reference.qpos[:2], (30, 1)))
