@@ -278,7 +278,7 @@ def test_fictional_forces_displace_head_and_root(environment, played):
 
 
 def test_numbers_that_make_no_ball_are_refused():
-    with pytest.raises(ValueError, match=r"ball\.pole_length must be positive, got 0"):
+    with pytest.raises(ValueError, match=r"task\.pole_length must be positive, got 0"):
         Ball(pole_length=0.0)
-    with pytest.raises(ValueError, match=r"ball\.head_force must be 0 or more, got -1"):
+    with pytest.raises(ValueError, match=r"task\.head_force must be 0 or more, got -1"):
         Ball(head_force=-1.0)
