@@ -62,6 +62,6 @@ def test_parameters_that_make_no_sense_are_named(wide, task, said):
 
 
 def test_one_level_of_compliance_needs_no_sequence(wide):
-    assert [level for _, level in _plan(wide, alpha=0.1).conditions] == [0.1]
+    assert [c.alpha for _, c in _plan(wide, alpha=0.1).conditions] == [0.1]
     with pytest.raises(ValueError, match=r"alpha must be in \[0, 1\], got 2"):
         _plan(wide, alpha=2)
