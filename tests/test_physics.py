@@ -165,3 +165,20 @@ def test_unknown_names_and_settings_are_refused(character: Character, scene):
         physics.make_scene(scene.model, character, root="hook")
     with pytest.raises(ValueError, match="newton_iterations"):
         physics.make_scene(scene.model, character, newton_iterations=0)
+    with pytest.raises(ValueError, match="unknown joint 'hook'"):
+        scene.address("hook")
+
+
+def test_contacts_of_the_ground_are_those_of_both_feet_with_the_sign_turned(scene):
+    feet = [scene.body(name) for name in ("left_foot", "right_foot")]
+    own, ground = scene.contacts(feet), scene.contacts([0], feet)
+    assert len(own.slots) == 8 and len(scene.contacts(feet[:1]).slots) == 4
+    np.testing.assert_array_equal(own.slots, ground.slots)
+    np.testing.assert_array_equal(own.body, ground.other)
+    np.testing.assert_array_equal(own.sign, -ground.sign)
+    assert not scene.contacts(feet[:1], feet[1:]).slots.size
+
+
+def test_address_of_a_joint_is_mujocos(scene):
+    knee = scene.model.joint("left_knee")
+    assert scene.address("left_knee") == (knee.qposadr[0], knee.dofadr[0])

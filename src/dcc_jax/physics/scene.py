@@ -131,10 +131,7 @@ def make_scene(
     if newton_iterations < 1:
         raise ValueError(f"newton_iterations must be >= 1, got {newton_iterations}")
     model = copy.copy(model)
-    qpos_adr, dof_adr = (
-        int(model.joint(root).qposadr[0]),
-        int(model.joint(root).dofadr[0]),
-    )
+    qpos_adr, dof_adr = _address(model, root)
     spd = np.zeros(model.nv)
     spd[dof_adr : dof_adr + character.nv] = model.opt.timestep * character.kv
     model.dof_armature += spd
