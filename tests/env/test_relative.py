@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from dcc_jax import physics, quat
-from dcc_jax.character import Character, asset_path, compose_scene
+from dcc_jax.character import CONTROL_DT, Character, asset_path, compose_scene
 from dcc_jax.control.compliance import ComplianceConfig
 from dcc_jax.control.stiffness import modulated_stiffness, stiffness
 from dcc_jax.env import features, relative
@@ -95,7 +95,7 @@ def test_a_runner_on_its_reference_is_not_displaced_by_any_force(character):
         state = environment.reset(reset_key, jnp.ones(()))
         action = jnp.zeros(environment.action_size)
         carry, plan = environment.begin(step_key, state, action)
-        middle = state.time + 0.5 * environment.control_dt
+        middle = state.time + 0.5 * CONTROL_DT
         q_m, qd_m = relative.between(coords, state.reference, plan.reference, 0.5)
         body = physics.initial_state(scene, q_m, qd_m.at[1].add(beside))
         carry = dataclasses.replace(carry, body=body, time=middle)
