@@ -16,14 +16,19 @@ from mujoco import mjx
 from dcc_jax import quat
 from dcc_jax.character import asset_path, load_character
 from dcc_jax.control import compliance
-from dcc_jax.control.stiffness import determinant, modulated_stiffness, stiffness
+from dcc_jax.control.config import ComplianceConfig
+from dcc_jax.control.stiffness import (
+    determinant,
+    modulated_stiffness,
+    softened_gains,
+    stiffness,
+)
 from dcc_jax.motion.clip import load_clip
 
 CHARACTER = load_character()
 MODEL = CHARACTER.spec().compile()
 COORDS = quat.Coordinates.of(MODEL)
-CONFIG = compliance.ComplianceConfig()
-MEASURED = compliance.ComplianceConfig(velocity="measured")
+CONFIG = ComplianceConfig()
 REST = compliance.at_rest(COORDS)
 H = CONFIG.response_time
 BATCH = 96
@@ -33,7 +38,7 @@ DT = 1.0 / 240.0
 
 def controller(weights=CHARACTER.column_weight, dt=DT):
     """Of the character, at the default settings."""
-    return compliance.Controller(CONFIG, COORDS, weights, dt)
+    return compliance.Controller(CONFIG, COORDS, weights, dt, np.ones(MODEL.nv))
 
 
 @jax.jit
@@ -48,7 +53,7 @@ def velocity(J, inverse, force, alpha, weights):
         return delta_qdd[0]
 
     displacement = compliance.algorithm_1(
-        controller(weights), REST, J[None], force[None], alpha, mass_solve
+        controller(weights), REST, J[None], force[None], alpha, None, mass_solve
     )
     return displacement.ud, delta_qdd[0][0]
 
@@ -59,7 +64,7 @@ def velocity(J, inverse, force, alpha, weights):
 def measured_velocity(J, xd, alpha, weights):
     """ud [BATCH, 42] from measured velocities [BATCH, 3] of the points."""
     return compliance.measured(
-        controller(weights), REST, J[None], jnp.ones((1, 3)), alpha, xd[None]
+        controller(weights), REST, J[None], jnp.ones((1, 3)), alpha, None, xd[None]
     ).ud
 
 
@@ -199,10 +204,10 @@ def powers(J, inverse, forces, weights):
     """f . (J ud) over its value for S = 1, at alpha = 1, [26 directions, 15 bodies]."""
     coords = quat.Coordinates.of(MODEL)  # its own, jax caches index arrays by precision
     rest = compliance.at_rest(coords)
-    plain = compliance.Controller(CONFIG, coords, weights, DT)
+    plain = compliance.Controller(CONFIG, coords, weights, DT, np.ones(MODEL.nv))
 
     def power(J, force):
-        given = plain, rest, J[None], force[None], 1.0
+        given = plain, rest, J[None], force[None], 1.0, None
         ud = compliance.algorithm_1(*given, lambda qfrc: qfrc @ inverse).ud
         yielding = J.T @ force
         return force @ (J @ ud) / (H * yielding @ (inverse @ yielding))
@@ -240,7 +245,7 @@ def test_forces_add_up_and_vmap_is_a_loop():
         def mass_solve(qfrc, inverse=pushes.inverse[pair]):
             return jnp.einsum("fi,fij->fj", qfrc, inverse)
 
-        given = controller(), REST, pushes.J[pair], pushes.force[pair], alpha
+        given = controller(), REST, pushes.J[pair], pushes.force[pair], alpha, None
         np.testing.assert_allclose(
             compliance.algorithm_1(*given, mass_solve).ud,
             each[pair].sum(axis=0),
@@ -333,16 +338,16 @@ def test_a_force_of_exactly_zero_adds_nothing_to_another():
     pushes = random_pushes(10, 100.0)
     forces = pushes.force[:2] * np.float32([[1.0], [0.0]])
     xd = np.ones((2, 3), np.float32)
-    given = controller(), REST, pushes.J[:2], forces, jnp.asarray(0.16)
+    given = controller(), REST, pushes.J[:2], forces, jnp.asarray(0.16), None
     both = compliance.measured(*given, xd).ud
-    given = controller(), REST, pushes.J[:1], forces[:1], jnp.asarray(0.16)
+    given = controller(), REST, pushes.J[:1], forces[:1], jnp.asarray(0.16), None
     np.testing.assert_allclose(both, compliance.measured(*given, xd[:1]).ud, rtol=1e-5)
 
 
 def test_step_is_the_same_without_jit():
     pushes = random_pushes(7, 100.0)
     together, _ = velocities(pushes)
-    given = controller(), REST, pushes.J[:1], pushes.force[:1], 0.16
+    given = controller(), REST, pushes.J[:1], pushes.force[:1], 0.16, None
     plain = compliance.algorithm_1(*given, lambda qfrc: qfrc @ pushes.inverse[0])
     np.testing.assert_allclose(together[0], plain.ud, rtol=1e-4, atol=1e-7)
     _, path = course(REST, together[0], 1, DT)
@@ -354,7 +359,8 @@ def test_step_is_the_same_without_jit():
 @pytest.mark.parametrize("root_dofs", [-1, MODEL.nv + 1])
 def test_a_root_of_more_columns_than_there_are_is_refused(root_dofs):
     with pytest.raises(ValueError, match="root_dofs must be in"):
-        compliance.Controller(CONFIG, COORDS, np.ones(MODEL.nv), DT, root_dofs)
+        ones = np.ones(MODEL.nv)
+        compliance.Controller(CONFIG, COORDS, ones, DT, ones, root_dofs)
 
 
 @pytest.mark.parametrize(
@@ -369,7 +375,7 @@ def test_a_root_of_more_columns_than_there_are_is_refused(root_dofs):
 )
 def test_a_bad_constant_is_refused_by_name(name, value):
     with pytest.raises(ValueError, match=f"{name} must be"):
-        compliance.ComplianceConfig(**{name: value})
+        ComplianceConfig(**{name: value})
 
 
 # A fixed-base arm of three hinges (J is square) and one of seven velocities.
@@ -391,7 +397,10 @@ BALLS = """
     <body name="lower" pos=".3 0 0"><joint type="ball"/>
       <geom size=".04" pos=".1 0 0" mass="0.5"/>
 </body></body></body></worldbody></mujoco>"""
-LEVELS = (0.0, 0.04, 0.08, 0.16, 0.5)
+LEVELS = {
+    "measured": (0.0, 0.04, 0.08, 0.16, 0.5),
+    "admittance": (0.0, 0.16, 0.5, 0.8, 0.9),
+}
 KP = 100.0
 
 
@@ -425,24 +434,34 @@ ARMS = {
 }
 
 
-def controllers(arm: Arm):
-    """One step of the controllers of B arms: displacements, J, qvel, alpha -> q_bar."""
+def controllers(arm: Arm, law: str):
+    """One step of the controllers of B arms.
+
+    displacements, J, qvel, forces, alpha -> displacements, q_bar
+    """
     coords, dt = quat.Coordinates.of(arm.model), arm.model.opt.timestep
-    of_arm = compliance.Controller(MEASURED, coords, arm.weights, dt, root_dofs=0)
+    of_arm = compliance.Controller(
+        CONFIG, coords, arm.weights, dt, np.full(arm.model.nv, KP), root_dofs=0
+    )
     q_m = jnp.asarray(arm.q_m, jnp.float32)
 
-    def step(displacement, J, qvel, alpha):
-        given = of_arm, displacement, J[None], jnp.ones((1, 3)), alpha
-        displacement = compliance.measured(*given, (J @ qvel)[None])
+    def step(displacement, J, qvel, force, alpha):
+        given = of_arm, displacement, J[None], force[None], alpha, None
+        if law == "measured":
+            displacement = compliance.measured(*given, (J @ qvel)[None])
+        else:
+            displacement = compliance.admittance(*given)
         return displacement, quat.oplus(coords, q_m, displacement.u)
 
     return compliance.at_rest(coords), jax.jit(jax.vmap(step))
 
 
-def simulated_rest(arm: Arm, forces: np.ndarray, levels: np.ndarray) -> np.ndarray:
+def simulated_rest(
+    arm: Arm, law: str, forces: np.ndarray, levels: np.ndarray
+) -> np.ndarray:
     """Where constant forces [B, 3] take the tip in 3 s of C MuJoCo, m [B, 3]."""
     model, body = arm.model, arm.model.body("lower").id
-    start, step = controllers(arm)
+    start, step = controllers(arm, law)
     displacement = jax.tree.map(lambda x: jnp.tile(x, (len(forces), 1)), start)
     q_bar = np.tile(arm.q_m, (len(forces), 1))
     runs = [mujoco.MjData(model) for _ in forces]
@@ -462,7 +481,9 @@ def simulated_rest(arm: Arm, forces: np.ndarray, levels: np.ndarray) -> np.ndarr
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
         qvel = np.stack([data.qvel for data in runs]).astype(np.float32)
-        displacement, target = step(displacement, J.astype(np.float32), qvel, levels)
+        displacement, target = step(
+            displacement, J.astype(np.float32), qvel, forces.astype(np.float32), levels
+        )
         q_bar = np.asarray(target, float)
     assert np.abs(qvel).max() < 1e-3
     return tips - began
@@ -472,22 +493,51 @@ def _tip(data: mujoco.MjData, body: int, point: tuple[float, float, float]):
     return data.xpos[body] + data.xmat[body].reshape(3, 3) @ np.array(point)
 
 
+def simulated_stiffness(arm: Arm, law: str, size: float) -> dict[float, np.ndarray]:
+    """K_hat [3, 3] at every level, from the yield to forces of `size` N."""
+    levels = LEVELS[law]
+    signed = size * np.concatenate([np.eye(3), -np.eye(3)])
+    forces = np.tile(signed, (len(levels), 1))
+    # The same yield at every level: a stiffness is that of small displacements.
+    shares = np.repeat(np.array(levels, np.float32), 6)
+    forces = forces * (1.0 - shares[:, None])
+    tips = simulated_rest(arm, law, forces, shares).reshape(len(levels), 2, 3, 3)
+    return {
+        alpha: np.linalg.inv((plus - minus).T / (2.0 * size * (1.0 - alpha)))
+        for alpha, (plus, minus) in zip(levels, tips, strict=True)
+    }
+
+
+def off(found: np.ndarray, expected: np.ndarray) -> float:
+    return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
+
+
+def small_force(K: np.ndarray) -> float:
+    """N, that moves a point of stiffness K by about a centimetre."""
+    return 0.01 * np.sqrt(np.linalg.eigvalsh(K)[0] * np.linalg.eigvalsh(K)[1])
+
+
 @pytest.mark.parametrize("name", ARMS)
 def test_simulated_static_stiffness_is_kp_one_minus_alpha_L(name):
     arm = ARMS[name]
     K = stiffness(arm.model, arm.q_m, "lower", arm.tip, KP)
-    size = 0.01 * np.sqrt(np.linalg.eigvalsh(K)[0] * np.linalg.eigvalsh(K)[1])
-    signed = size * np.concatenate([np.eye(3), -np.eye(3)])
-    forces = np.tile(signed, (len(LEVELS), 1))
-    levels = np.repeat(np.array(LEVELS, np.float32), 6)
-    tips = simulated_rest(arm, forces, levels).reshape(len(LEVELS), 2, 3, 3)
-    for alpha, (plus, minus) in zip(LEVELS, tips, strict=True):
-        K_hat = np.linalg.inv((plus - minus).T / (2.0 * size))
-        expected = modulated_stiffness(K, alpha)
-        error = np.linalg.norm(K_hat - expected) / np.linalg.norm(expected)
-        assert error < (0.01 if alpha == 0.0 else 0.02)
+    for alpha, K_hat in simulated_stiffness(arm, "measured", small_force(K)).items():
+        assert off(K_hat, modulated_stiffness(K, alpha)) < (0.02 if alpha else 0.01)
         ratio = determinant(0.5 * (K_hat + K_hat.T)) / determinant(K)
         assert ratio == pytest.approx((1.0 - alpha) ** 3, rel=0.04)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_admittance_has_the_stiffness_of_the_softened_gains_at_any_level(name):
+    arm = ARMS[name]
+    kp = np.full(arm.model.nv, KP)
+    K = stiffness(arm.model, arm.q_m, "lower", arm.tip, KP)
+    found = simulated_stiffness(arm, "admittance", small_force(K))
+    for alpha, K_hat in found.items():
+        soft = softened_gains(kp, arm.weights, alpha)
+        assert off(K_hat, stiffness(arm.model, arm.q_m, "lower", arm.tip, soft)) < 0.01
+        if np.all(arm.weights == 1.0):
+            assert off(K_hat, modulated_stiffness(K, alpha)) < 0.01
 
 
 def test_delta_qdd_is_the_difference_of_two_forward_passes_of_mjx():

@@ -15,8 +15,8 @@ import pytest
 
 from dcc_jax import physics, quat
 from dcc_jax.character import CONTROL_DT, Character, asset_path, compose_scene
-from dcc_jax.control.compliance import ComplianceConfig
-from dcc_jax.control.stiffness import modulated_stiffness, stiffness
+from dcc_jax.control.config import ComplianceConfig
+from dcc_jax.control.stiffness import modulated_stiffness, softened_gains, stiffness
 from dcc_jax.env import features, relative
 from dcc_jax.env.config import EnvConfig
 from dcc_jax.env.environment import Environment
@@ -26,7 +26,7 @@ from dcc_jax.motion.reference import References, make_references
 from dcc_jax.tasks.push import Push
 
 BODIES = ("pelvis", "chest", "head", "left_hand", "right_foot")
-MEASURED = ComplianceConfig(velocity="measured")
+MEASURED = ComplianceConfig(law="measured")
 
 
 def loaded(names: tuple[str, ...]) -> References:
@@ -123,7 +123,7 @@ def test_a_runner_on_its_reference_is_not_displaced_by_any_force(character):
 def test_measured_velocities_without_a_reference_in_time_are_refused(character):
     config = EnvConfig(compliance=MEASURED)
     with pytest.raises(
-        ValueError, match=r"env\.compliance\.velocity must be .*'push'.* got 'measured'"
+        ValueError, match=r"env\.compliance\.law must be .*'push'.* got 'measured'"
     ):
         Environment(Push(), character, loaded(("stand",)), config)
 
@@ -180,14 +180,20 @@ def stiff(character: Character) -> Character:
     )
 
 
-def test_static_stiffness_through_the_environment_is_kp_one_minus_alpha_L(character):
+@pytest.mark.parametrize("law", ["measured", "admittance"])
+def test_static_stiffness_through_the_environment_is_kp_one_minus_alpha_L(
+    character, law
+):
     levels, forces = np.array([0.0, 0.16, 0.5]), np.concatenate([np.eye(3), -np.eye(3)])
     task, character = HeldAndPulled(), stiff(character)
     pose = load_clip(asset_path("motions/run_cycle.npz")).qpos[5].copy()
     pose[:7] = compose_scene(character, floor=False).qpos0[:7]
     still = Clip(name="still", qpos=np.tile(pose, (90, 1)), fps=30.0, loop=True)
     environment = Environment(
-        task, character, make_references([still]), EnvConfig(compliance=MEASURED)
+        task,
+        character,
+        make_references([still]),
+        EnvConfig(compliance=ComplianceConfig(law=law)),
     )
 
     @jax.jit
@@ -215,6 +221,11 @@ def test_static_stiffness_through_the_environment_is_kp_one_minus_alpha_L(charac
     ):
         K_hat = np.linalg.inv((plus - minus).T / (2.0 * task.newtons))
         expected = modulated_stiffness(K, float(alpha))
+        if law == "admittance":  # whose joints of weight 2 are softer
+            soft = softened_gains(
+                _gains(character), character.column_weight, float(alpha)
+            )
+            expected = stiffness(environment.scene.model, pose, "left_hand", kp=soft)
         error = np.linalg.norm(K_hat - expected) / np.linalg.norm(expected)
         assert error < (0.01 if alpha == 0.0 else 0.02)
 

@@ -47,6 +47,7 @@ _GPU = {
 # earlier trainer (MASS, 2019), 2048 tuples come from 16 environments, one per core of
 # their machine, and a discriminator pass is one over the tuples.
 _PAPER = {
+    "env.compliance.law": "algorithm_1",
     "env.physics_rate": 600,
     "ppo.value_learning_rate": 1e-5,
     "ppo.target_kl": None,

@@ -1,38 +1,33 @@
-"""The compliance-induced motion controller (Sec. 3.3 and 3.4, Alg. 1).
+"""The compliance-induced motion controller (Sec. 3.3 and 3.4): three laws.
 
-It turns external forces into a displacement u of the reference motion. Everything here
-is written for ONE environment and knows no physics: Jacobians, forces and a solver of
-the mass matrix come in, a displacement comes out. Letters: F forces, nv velocities, nq
-coordinates.
+External forces displace the reference motion by u; PD follows q_m (+) u. Eq. (6) asks
+for dq_bar/dx = alpha J^T L, L = (J J^T)^-1, and gets Eq. (7), K_hat = kp (1 - alpha) L.
 
-The columns of J carry weights (Sec. 5.1), W = diag(w) >= 0. The displacement velocity
-of one force is
+    algorithm_1   u' = alpha W J^T L h J M^-1 J^T f      Alg. 1
+    measured      u' = alpha W J^T L (xd - xd of q_m)    Eq. (8)
+    admittance    u -> alpha / (1 - alpha) W J^T f / kp  Eq. (6) and (7), solved for u
 
-    ud = alpha W J^T L xd,   L = (J W J^T + damping I)^-1.
+Alg. 1 follows the impulse of a force. While a force lasts u creeps, so that there is no
+static stiffness. With measured velocities u rests when the character does; Eq. (7) then
+holds for any weights, as long as every joint is driven by PD. Admittance goes to the
+displacement that Eq. (6) and (7) have at rest, and holds there whatever the motion.
 
-It has the shape W J^T (...) of the paper's recipe, a joint of weight 2 turns twice as
-far as it otherwise would, and J ud = alpha xd for any positive weights: the point of
-contact yields by the share alpha.
-Departure: scaling the columns everywhere, J' = J W, gives (J W^2 J^T)^-1 instead, hence
-J ud = alpha J W J^T (J W^2 J^T)^-1 xd, which no longer is alpha xd, and Eq. (7) would
-hold for equal weights alone.
+The columns of J carry weights (Sec. 5.1), W = diag(w) >= 0. In the first two laws
+L = (J W J^T + damping I)^-1, so that J u' = alpha xd for any positive weights: the
+point yields by the share alpha. In the third a joint of weight w has the stiffness
+kp / (1 + w alpha / (1 - alpha)), which is kp (1 - alpha) at weight 1.
+Departure: scaling the columns everywhere, J' = J W, gives (J W^2 J^T)^-1 instead, and
+Eq. (7) would hold for equal weights alone.
 
-What follows from J ud = alpha xd, with xd the measured velocity of the point: PD rests
-where kp (q_m (+) u - q) + J^T f = 0, so x = J (q - q_m) = alpha x + J J^T f / kp, which
-is Eq. (7), K_hat = kp (1 - alpha) L. It needs neither equal weights nor a square J, but
-it does need: every joint driven by PD (a fixed base), displacements small enough for J
-to be constant, directions in which J W J^T is well above the damping, and a velocity
-that is measured. With the velocity of Alg. 1 u creeps for as long as the force acts and
-there is no static stiffness at all.
+Everything here is written for ONE environment and knows no physics. Letters: F forces,
+nv velocities, nq coordinates.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, get_args
 
 import chex
 import flax.struct
@@ -41,48 +36,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from dcc_jax import quat
+from dcc_jax.character import Character
+from dcc_jax.control import ranges
+from dcc_jax.control.config import ComplianceConfig
+from dcc_jax.control.ranges import JointRanges, Room
+from dcc_jax.control.small_matrix import (
+    norm,
+    shorten,
+    solve_damped,
+    times,
+    transpose_times,
+)
 
 Array = jax.Array
-Velocity = Literal["forward_dynamics", "measured"]
-
-
-@dataclass(frozen=True)
-class ComplianceConfig:
-    """Constants of the controller. The level alpha is not one: it may vary by episode.
-
-    Raises:
-        ValueError: an unknown `velocity`, or a number that is not positive and finite.
-    """
-
-    velocity: Velocity = "forward_dynamics"
-    """Where xd comes from: Alg. 1, or Eq. (8) read literally, which needs a task that
-    follows its reference in time."""
-    response_time: float = 1.0 / 600.0
-    """The h in xd = h J delta_qdd, s. The paper tuned alpha at 600 Hz (Sec. 5.1); it
-    stays when the physics runs at another rate."""
-    damping: float = 1e-4
-    """Added to J W J^T, m^2: J W J^T L of a lever arm of 1 cm is 1/2, of one of 10 cm
-    0.99. Alg. 1 yields by its square, Eq. (8) with measured velocities by itself."""
-    joint_return_stiffness: float = 100.0
-    """Of the spring-damper that takes u back, 1/s^2. Sec. 5.1 names the spring without
-    a number; our choice, a time constant of 1 / sqrt(100) = 0.1 s."""
-    root_return_stiffness: float = 60.0
-    """The same for the root, 1/s^2, our choice: 0.13 s, a step back takes longer."""
-
-    def __post_init__(self) -> None:
-        if self.velocity not in get_args(Velocity):
-            raise ValueError(
-                f"velocity must be one of {get_args(Velocity)}, got {self.velocity!r}"
-            )
-        for name in (
-            "response_time",
-            "damping",
-            "joint_return_stiffness",
-            "root_return_stiffness",
-        ):
-            value = getattr(self, name)
-            if not 0.0 < value < math.inf:
-                raise ValueError(f"{name} must be positive and finite, got {value}")
 
 
 @flax.struct.dataclass
@@ -111,13 +77,30 @@ class Controller:
     coords: quat.Coordinates  # the layout of u
     weights: np.ndarray | Array  # [nv] of J's columns, not negative
     dt: float  # physics step, s
+    kp: np.ndarray | Array  # [nv] N m/rad, N/m; positive where the weight is
     root_dofs: int = 6  # how many of the first columns are the root's
+    ranges: JointRanges | None = None  # None: nothing bounds u
 
     def __post_init__(self) -> None:
         if not 0 <= self.root_dofs <= self.coords.nv:
             raise ValueError(
                 f"root_dofs must be in [0, {self.coords.nv}], got {self.root_dofs}"
             )
+
+    @classmethod
+    def of(
+        cls,
+        config: ComplianceConfig,
+        character: Character,
+        coords: quat.Coordinates,
+        dt: float,
+    ) -> Controller:
+        """Of a character, with its weights, gains and joint ranges."""
+        kp = character.kp.copy()
+        kp[:6] = character.scale * config.root_stiffness
+        limits = JointRanges(character.lower, character.upper)
+        weights = character.column_weight
+        return cls(config, coords, weights, dt, kp=kp, ranges=limits)
 
     @property
     def return_stiffness(self) -> np.ndarray:
@@ -126,6 +109,10 @@ class Controller:
         stiffness[: self.root_dofs] = self.config.root_return_stiffness
         return stiffness
 
+    def room(self, q_m: Array) -> Room | None:
+        """What a reference q_m [nq] leaves of the joint ranges to u."""
+        return None if self.ranges is None else self.ranges.room(self.coords, q_m)
+
 
 def algorithm_1(
     controller: Controller,
@@ -133,6 +120,7 @@ def algorithm_1(
     J: Array,
     forces: Array,
     alpha: Array,
+    room: Room | None,
     mass_solve: Callable[[Array], Array],
 ) -> Displacement:
     """The displacement one physics step later, by Alg. 1.
@@ -160,18 +148,19 @@ def algorithm_1(
         J: Jacobians of the points where the forces act [F, 3, nv], world frame.
         forces: N, world frame [F, 3]; exactly zero where none acts.
         alpha: level of compliance, in [0, 1] (unchecked: it is traced).
+        room: of the reference, that u stays in; see `Controller.room`.
         mass_solve: M^-1 times generalized forces [F, nv]. Forward dynamics is linear in
             the external force: M^-1 J^T f is FD(q, qd, f) - FD(q, qd, 0).
     """
     h = controller.config.response_time
     W, JWJ, L = _laplacian(controller, J)
-    f = _times(JWJ, L(forces))
-    delta_qdd = mass_solve(_transpose_times(J, f))
-    xd = h * _times(J, delta_qdd)
-    ud = W * _transpose_times(J, L(xd))
-    ud = _shorten(ud, h * _norm(delta_qdd))
+    f = times(JWJ, L(forces))
+    delta_qdd = mass_solve(transpose_times(J, f))
+    xd = h * times(J, delta_qdd)
+    ud = W * transpose_times(J, L(xd))
+    ud = shorten(ud, h * norm(delta_qdd))
     ud = alpha * jnp.sum(ud, axis=0)
-    return advance(controller, displacement, ud, acting(forces))
+    return advance(controller, displacement, ud, acting(forces), room)
 
 
 def measured(
@@ -180,6 +169,7 @@ def measured(
     J: Array,
     forces: Array,
     alpha: Array,
+    room: Room | None,
     xd: Array,
 ) -> Displacement:
     """The displacement one physics step later, by Eq. (8) with measured velocities.
@@ -190,13 +180,49 @@ def measured(
         J: Jacobians of the points where the forces act [F, 3, nv], world frame.
         forces: N, world frame [F, 3]; exactly zero where none acts.
         alpha: level of compliance, in [0, 1] (unchecked: it is traced).
+        room: of the reference, that u stays in; see `Controller.room`.
         xd: velocities of the points less those of the same points of the reference,
             displaced by a u at rest, m/s [F, 3].
     """
     W, _, L = _laplacian(controller, J)
     xd = jnp.any(forces != 0.0, axis=-1, keepdims=True) * xd
-    ud = alpha * jnp.sum(W * _transpose_times(J, L(xd)), axis=0)
-    return advance(controller, displacement, ud, acting(forces))
+    ud = alpha * jnp.sum(W * transpose_times(J, L(xd)), axis=0)
+    return advance(controller, displacement, ud, acting(forces), room)
+
+
+def admittance(
+    controller: Controller,
+    displacement: Displacement,
+    J: Array,
+    forces: Array,
+    alpha: Array,
+    room: Room | None,
+) -> Displacement:
+    """The displacement one physics step later, on its way to where Eq. (7) has it.
+
+    At rest x = K_hat^-1 f, and Eq. (6) gives u = alpha J^T L x. Joint by joint,
+
+        u* = alpha / (1 - alpha) W J^T f / kp,    u'' = w^2 (u* - u) - 2 w u',
+
+    with w^2 the return stiffness. Without a force this is the return of Sec. 5.1.
+    f . (J u*) >= 0, whatever the weights and the room.
+
+    Args:
+        controller: of the character.
+        displacement: before the step.
+        J: Jacobians of the points where the forces act [F, 3, nv], world frame.
+        forces: N, world frame [F, 3]; exactly zero where none acts.
+        alpha: level of compliance, in [0, 1) (unchecked: it is traced).
+        room: of the reference, that u stays in; see `Controller.room`.
+    """
+    chex.assert_shape(J, (None, 3, controller.coords.nv))
+    W = jnp.asarray(controller.weights, J.dtype)
+    torque = jnp.sum(transpose_times(J, forces), axis=0)
+    rest = alpha / (1.0 - alpha) * W * torque / jnp.asarray(controller.kp, J.dtype)
+    if room is not None:
+        rest = ranges.bounded(controller.coords, room, rest)
+    ud = _sprung(controller, displacement, rest)
+    return _integrated(controller, displacement, ud, room)
 
 
 def acting(forces: Array) -> Array:
@@ -205,26 +231,46 @@ def acting(forces: Array) -> Array:
 
 
 def advance(
-    controller: Controller, displacement: Displacement, ud: Array, active: Array
+    controller: Controller,
+    displacement: Displacement,
+    ud: Array,
+    active: Array,
+    room: Room | None = None,
 ) -> Displacement:
     """The displacement one physics step later: u (+) dt ud.
 
-    While a force acts, ud is what the forces ask for. When none does, (u, ud) is a
-    critically damped spring-damper of unit mass back to zero, integrated by implicit
-    Euler, stable for any dt. ud carries over from the one to the other.
+    While a force acts, ud is what the forces ask for. When none does, a spring-damper
+    takes u back to zero. ud carries over from the one to the other.
 
     Args:
         controller: of the character.
         displacement: before the step.
         ud: velocity that the forces ask for [nv].
         active: whether any force acts, a boolean; see `acting`.
+        room: of the reference, that u stays in.
     """
-    coords, dt = controller.coords, controller.dt
-    k = jnp.asarray(controller.return_stiffness, ud.dtype)
-    offset = quat.log_map(coords, displacement.u)
-    ud_return = (displacement.ud - dt * k * offset) / (1.0 + dt * jnp.sqrt(k)) ** 2
-    ud = jnp.where(active, ud, ud_return)
-    return Displacement(u=quat.integrate(coords, displacement.u, ud, dt), ud=ud)
+    ud = jnp.where(active, ud, _sprung(controller, displacement, jnp.zeros_like(ud)))
+    return _integrated(controller, displacement, ud, room)
+
+
+def _sprung(controller: Controller, displacement: Displacement, rest: Array) -> Array:
+    """Velocity [nv] a step later of a critically damped spring-damper of unit mass.
+
+    Its rest position is the tangent `rest` [nv]. Implicit Euler, stable for any dt.
+    """
+    dt = controller.dt
+    k = jnp.asarray(controller.return_stiffness, rest.dtype)
+    offset = quat.log_map(controller.coords, displacement.u) - rest
+    return (displacement.ud - dt * k * offset) / (1.0 + dt * jnp.sqrt(k)) ** 2
+
+
+def _integrated(
+    controller: Controller, displacement: Displacement, ud: Array, room: Room | None
+) -> Displacement:
+    u = quat.integrate(controller.coords, displacement.u, ud, controller.dt)
+    if room is not None:
+        u = ranges.clip(controller.coords, room, u)
+    return Displacement(u=u, ud=ud)
 
 
 def _laplacian(
@@ -234,47 +280,4 @@ def _laplacian(
     chex.assert_shape(J, (None, 3, controller.coords.nv))
     W = jnp.asarray(controller.weights, J.dtype)
     JWJ = jnp.sum((J * W)[:, :, None, :] * J[:, None, :, :], axis=-1)
-    return W, JWJ, partial(_solve_damped, JWJ, controller.config.damping)
-
-
-def _times(A: Array, v: Array) -> Array:
-    """A v [F, m] of A [F, m, n] and v [F, n]."""
-    return jnp.sum(A * v[:, None, :], axis=-1)
-
-
-def _transpose_times(J: Array, x: Array) -> Array:
-    """J^T x [F, nv] of J [F, 3, nv] and x [F, 3]."""
-    return jnp.sum(J * x[:, :, None], axis=1)
-
-
-def _norm(v: Array) -> Array:
-    return jnp.sqrt(jnp.sum(jnp.square(v), axis=-1))
-
-
-def _shorten(v: Array, bound: Array) -> Array:
-    """v [..., n] scaled down to the norm `bound` where it is longer."""
-    norm = _norm(v)
-    longer = norm > bound
-    return v * jnp.where(longer, bound / jnp.where(longer, norm, 1.0), 1.0)[..., None]
-
-
-def _solve_damped(A: Array, damping: float, b: Array) -> Array:
-    """(A + damping I)^-1 b for positive semidefinite A [..., 3, 3], b [..., 3].
-
-    A = U^T D U written out: `jnp.linalg` costs one LAPACK call an environment, and the
-    adjugate loses all digits in float32 where two directions are singular.
-    """
-    d0 = A[..., 0, 0] + damping
-    u01, u02 = A[..., 0, 1] / d0, A[..., 0, 2] / d0
-    d1 = A[..., 1, 1] + damping - A[..., 0, 1] * u01
-    d1 = jnp.maximum(d1, damping)
-    u12 = (A[..., 1, 2] - A[..., 0, 1] * u02) / d1
-    d2 = A[..., 2, 2] + damping - A[..., 0, 2] * u02 - d1 * u12 * u12
-    d2 = jnp.maximum(d2, damping)
-    y0 = b[..., 0]
-    y1 = b[..., 1] - u01 * y0
-    y2 = b[..., 2] - u02 * y0 - u12 * y1
-    x2 = y2 / d2
-    x1 = y1 / d1 - u12 * x2
-    x0 = y0 / d0 - u01 * x1 - u02 * x2
-    return jnp.stack([x0, x1, x2], axis=-1)
+    return W, JWJ, partial(solve_damped, JWJ, controller.config.damping)

@@ -71,13 +71,32 @@ def stiffness(
     return (axes / np.maximum(yields, 1.0 / STIFFNESS_LIMIT)) @ axes.T
 
 
+def softened_gains(kp: np.ndarray, weights: np.ndarray, alpha: float) -> np.ndarray:
+    """Gains [nv] that have a mechanism rest where the law `admittance` has it rest.
+
+    kp / (1 + w alpha / (1 - alpha)), joint by joint; at weight 1 it is kp (1 - alpha)
+    and `stiffness` of it Eq. (7).
+
+    Args:
+        kp: proportional gains [nv], N m/rad.
+        weights: of the columns of J [nv] (Sec. 5.1).
+        alpha: level of compliance, 0 to 1, exclusive.
+
+    Raises:
+        ValueError: an alpha outside [0, 1).
+    """
+    if not 0.0 <= alpha < 1.0:
+        raise ValueError(f"alpha must be in [0, 1), got {alpha}")
+    return kp / (1.0 + weights * alpha / (1.0 - alpha))
+
+
 def modulated_stiffness(K: np.ndarray, alpha: float) -> np.ndarray:
     """K_hat = (1 - alpha) K, Eq. (7): what the compliance controller leaves of K.
 
     Eq. (5) is the stiffness where the target q_bar moves along,
     kp (L - J^-T dq_bar/dx), and Eq. (6) the choice dq_bar/dx = alpha J^T L.
 
-    It is reached by the controller whose velocity is measured; see
+    It is reached by the laws `measured` and, at equal weights, `admittance`; see
     `dcc_jax.control.compliance` for the conditions.
 
     Args:

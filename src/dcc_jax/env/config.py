@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from dcc_jax.character import CONTROL_RATE
-from dcc_jax.control.compliance import ComplianceConfig
+from dcc_jax.control.config import ComplianceConfig
 from dcc_jax.env.rewards import RewardConfig
 
 
@@ -25,7 +25,8 @@ class EnvConfig:
     """Of the contact solver, at most (docs/performance.md)."""
 
     alpha: float = 0.16
-    """Level of compliance, in [0, 1] (Sec. 5.2 mostly uses 0.16)."""
+    """Level of compliance, in [0, 1], with `admittance` in [0, 0.9] (Sec. 5.2 mostly
+    uses 0.16)."""
 
     alpha_max: float | None = None
     """With it alpha is drawn from [alpha, alpha_max] in every episode and observed."""
@@ -62,12 +63,13 @@ class EnvConfig:
                 "env.physics_rate must be a multiple of 30, 60 or more, got "
                 f"{self.physics_rate}"
             )
-        if not 0.0 <= self.alpha <= 1.0:
-            raise ValueError(f"env.alpha must be in [0, 1], got {self.alpha}")
-        if self.alpha_max is not None and not self.alpha <= self.alpha_max <= 1.0:
-            raise ValueError(
-                f"env.alpha_max must be in [alpha, 1], got {self.alpha_max}"
-            )
+        self.compliance.check_alpha(self.alpha, "env.alpha")
+        if self.alpha_max is not None:
+            self.compliance.check_alpha(self.alpha_max, "env.alpha_max")
+            if self.alpha_max < self.alpha:
+                raise ValueError(
+                    f"env.alpha_max must be at least alpha, got {self.alpha_max}"
+                )
         if not self.episode_seconds > 0.1:
             raise ValueError(
                 f"env.episode_seconds must be more than 0.1, got {self.episode_seconds}"

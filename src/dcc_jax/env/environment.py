@@ -48,7 +48,7 @@ class Environment:
         references: References,
         config: EnvConfig,
     ) -> None:
-        _check_velocity(task, config)
+        _check_law(task, config)
         self.task = task
         self.config = config
         self.references = references
@@ -64,11 +64,8 @@ class Environment:
         alone = compose_scene(character, floor=False)
         self.kinematics = features.Kinematics.of(alone)
         self.nominal = jax.jit(expert.nominal_pose)(references)
-        self.controller = compliance.Controller(
-            config.compliance,
-            self.kinematics.coords,
-            character.column_weight,
-            self.scene.timestep,
+        self.controller = compliance.Controller.of(
+            config.compliance, character, self.kinematics.coords, self.scene.timestep
         )
         self.fallen = outcome.FallTest.of(config, references)
         self.expert_lead = expert.lead(character, CONTROL_DT)
@@ -166,8 +163,10 @@ class Environment:
         pose = self._target_pose(reference, action)
         sums = metrics.no_sums(state.alpha)
         start = Substep(body, state.displacement, task, state.time, sums)
+        q_m = reference.qpos if self.task.tracks_reference else pose
+        room = self.controller.room(q_m)
         return start, ControlInputs(
-            action, pose, state.alpha, state.reference, reference, state.time
+            action, pose, state.alpha, room, state.reference, reference, state.time
         )
 
     def end(self, state: EnvState, inputs: ControlInputs, end: Substep) -> EnvState:
@@ -187,6 +186,7 @@ class Environment:
                 self.config.control_steps,
                 self.kinematics.coords,
                 end.displacement.u,
+                inputs.room,
             ),
         )
         return terminate_on_nonfinite(self._judged(self.observed(new)), state)
@@ -295,10 +295,10 @@ class Environment:
         return self.task.root_target(self.scene, state.task, state.start, state.time)
 
 
-def _check_velocity(task: Task, config: EnvConfig) -> None:
-    if config.compliance.velocity == "measured" and not task.tracks_reference:
+def _check_law(task: Task, config: EnvConfig) -> None:
+    if config.compliance.law == "measured" and not task.tracks_reference:
         raise ValueError(
-            "env.compliance.velocity must be 'forward_dynamics' for task "
+            "env.compliance.law must be 'algorithm_1' or 'admittance' for task "
             f"{task.name!r}, which follows no reference in time, got 'measured'"
         )
 

@@ -7,7 +7,9 @@ import jax
 import jax.numpy as jnp
 
 from dcc_jax import quat
+from dcc_jax.control import ranges
 from dcc_jax.control.compliance import acting
+from dcc_jax.control.ranges import Room
 
 Array = jax.Array
 
@@ -29,6 +31,7 @@ class Metrics:
     power: Array  # [] W, mean of the sum of |torque x speed| over the axes
     displacement: Array  # [] rad, norm of log u over the joints
     root_displacement: Array  # [] m, of u
+    range_share: Array  # [] share of the time in which the joint ranges soften u
 
 
 def no_metrics() -> Metrics:
@@ -82,8 +85,18 @@ def add(sums: Sums, force: Array, torque: Array, speed: Array, h: float) -> Sums
     )
 
 
-def metrics(sums: Sums, steps: int, coords: quat.Coordinates, u: Array) -> Metrics:
-    """Of a control step of so many physics steps that ends with displacement u [55]."""
+def metrics(
+    sums: Sums, steps: int, coords: quat.Coordinates, u: Array, room: Room | None
+) -> Metrics:
+    """Of a control step.
+
+    Args:
+        sums: of its physics steps.
+        steps: how many they are.
+        coords: of the character.
+        u: displacement [55] at its end.
+        room: what the reference leaves of the joint ranges.
+    """
     contact = jnp.maximum(sums.contact_steps, 1.0)
     log_u = quat.log_map(coords, u)
     return Metrics(
@@ -96,4 +109,11 @@ def metrics(sums: Sums, steps: int, coords: quat.Coordinates, u: Array) -> Metri
         power=sums.power / steps,
         displacement=jnp.sqrt(jnp.sum(jnp.square(log_u[6:])) + 1e-12),
         root_displacement=jnp.sqrt(jnp.sum(jnp.square(log_u[:3])) + 1e-12),
+        range_share=_softened(coords, room, u),
     )
+
+
+def _softened(coords: quat.Coordinates, room: Room | None, u: Array) -> Array:
+    if room is None:
+        return jnp.zeros(())
+    return ranges.softened(coords, room, u).astype(u.dtype)

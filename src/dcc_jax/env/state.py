@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from dcc_jax import physics
 from dcc_jax.control.compliance import Displacement
+from dcc_jax.control.ranges import Room
 from dcc_jax.env.metrics import Metrics, Sums
 from dcc_jax.env.task import RootTarget
 from dcc_jax.motion.reference import RefState
@@ -51,6 +52,7 @@ class ControlInputs:
     action: Array  # [A]
     pose: Array  # [55] that the policy asks for
     alpha: Array  # []
+    room: Room | None  # of u, that the reference's pose leaves of the joint ranges
     reference_before: RefState  # at the beginning of the control step
     reference: RefState  # at its end
     time: Array  # [] s since the reset, at its beginning

@@ -59,8 +59,11 @@ class Side:
         jacobian = jax.vmap(lambda p, b: physics.point_jacobian(scene, kin, p, b))
         J = scene.character_qvel(jacobian(forces.point_w, forces.body))
         force = jnp.where(forces.gate, forces.force_w, 0.0)
-        given = self.controller, carry.displacement, J, force, inputs.alpha
-        if self.controller.config.velocity == "measured":
+        controller, law = self.controller, self.controller.config.law
+        given = controller, carry.displacement, J, force, inputs.alpha, inputs.room
+        if law == "admittance":
+            return compliance.admittance(*given)
+        if law == "measured":
             xd = relative.velocity(scene, self.kinematics, carry, inputs, J, forces)
             return compliance.measured(*given, xd)
 

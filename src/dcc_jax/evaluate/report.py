@@ -156,8 +156,8 @@ def _check(
     if count < 1:
         raise ValueError(f"episodes must be 1 or more, got {count}")
     for level in alpha if alpha is not None else ():
-        if not 0.0 <= level <= 1.0:
-            raise ValueError(f"alpha must be in [0, 1], got {level}")
+        for run in runs:
+            run.config.env.compliance.check_alpha(level)
     if alpha is not None and len(set(alpha)) < max(1, len(alpha)):
         raise ValueError(f"alpha must be different numbers, got {list(alpha)}")
     if not 0 <= seed < 2**32:

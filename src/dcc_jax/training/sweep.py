@@ -104,7 +104,7 @@ def sweep(
         RunError: the sweep failed; its checkpoints are intact.
     """
     runtime.ensure(quiet=quiet)
-    settings = _settings(seeds, alpha)
+    settings = _settings(config, seeds, alpha)
     prepared = _prepare(config, settings, run_dir, resume, environment)
     total = config.train.total_tuples
     with logs.Progress(total, quiet) as progress, StopSignal() as stop:
@@ -115,7 +115,7 @@ def sweep(
 
 
 def _settings(
-    seeds: int | Iterable[int], alpha: float | Iterable[float] | None
+    config: Config, seeds: int | Iterable[int], alpha: float | Iterable[float] | None
 ) -> list[Setting]:
     chosen = [seeds] if isinstance(seeds, int | np.integer) else list(seeds)
     levels = [alpha] if alpha is None or isinstance(alpha, float | int) else list(alpha)
@@ -132,8 +132,8 @@ def _settings(
     for seed, level in runs:
         if not 0 <= seed < 2**32:
             raise ValueError(f"seeds must be between 0 and 2^32 - 1, got {seed}")
-        if level is not None and not 0.0 <= level <= 1.0:
-            raise ValueError(f"alpha must be in [0, 1], got {level}")
+        if level is not None:
+            config.env.compliance.check_alpha(level)
     return runs
 
 

@@ -1,0 +1,133 @@
+"""The room that the joint ranges leave to a displacement u of the reference q_m.
+
+A joint's pose is its rotation vector r = log(q_m u), and its range a box of such
+vectors. The room is the way from log(q_m) to the sides of the box. Where q_m itself is
+outside, the box reaches out to it, so that u = 0 is always inside. Everything is
+written for ONE environment. Letters: J ball joints, nq coordinates, nv velocities.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dcc_jax import quat
+
+Array = jax.Array
+
+LINEAR_SHARE = 0.5
+"""Of its room that a joint uses before a displacement is shortened. Up to there the
+stiffness is what theory gives; beyond, u approaches the end of the room and never
+reaches it."""
+ROOT_ROOM = 0.6
+"""m, of the root over the ground: a long step, from which the feet follow."""
+
+
+@dataclass(frozen=True, eq=False)
+class JointRanges:
+    """Bounds of the rotation vectors of a model's last J ball joints."""
+
+    lower: np.ndarray  # [J, 3] rad
+    upper: np.ndarray  # [J, 3] rad
+
+    def room(self, coords: quat.Coordinates, q_m: Array) -> Room:
+        """What q_m [nq] leaves of the ranges."""
+        pose = coords.split_q(q_m)[1][-len(self.lower) :]
+        r = quat.log(pose)
+        lower = jnp.minimum(jnp.asarray(self.lower, r.dtype), r)
+        upper = jnp.maximum(jnp.asarray(self.upper, r.dtype), r)
+        return Room(pose, r, lower, upper)
+
+
+@flax.struct.dataclass
+class Room:
+    """Of J joints, for one q_m."""
+
+    pose: Array  # [J, 4] q_m
+    r: Array  # [J, 3] rad, log(q_m)
+    lower: Array  # [J, 3] rad
+    upper: Array  # [J, 3] rad
+
+    def used(self, r: Array) -> Array:
+        """Share of its room [J] that a joint at the rotation vector r [J, 3] uses."""
+        way = r - self.r
+        room = jnp.where(way > 0.0, self.upper - self.r, self.r - self.lower)
+        return jnp.max(jnp.abs(way) / jnp.maximum(room, 1e-6), axis=-1)
+
+    def turned(self, u: Array) -> Array:
+        """log(q_m u) [J, 3] of a displacement's quaternions [J, 4].
+
+        Beyond half a turn the rotation vector nearer to q_m's counts.
+        """
+        r = quat.log(quat.mul(self.pose, u))
+        angle = jnp.sqrt(jnp.sum(r * r, axis=-1, keepdims=True) + 1e-12)
+        other = r * (1.0 - 2.0 * jnp.pi / angle)
+        nearer = _square(other - self.r) < _square(r - self.r)
+        return jnp.where(nearer, other, r)
+
+
+def bounded(coords: quat.Coordinates, room: Room, rest: Array) -> Array:
+    """A displacement's tangent [nv] shortened so that it stays in the room.
+
+    Each joint by a factor of its own, in (0, 1]: the direction in which it turns stays,
+    and with it f . (J rest) >= 0. The joint's rotation vector is taken to first order,
+    log(q_m exp(w)) = r + Jr^-1(r) w with Jr the right Jacobian of SO(3).
+
+    Args:
+        coords: of the character.
+        room: of its q_m.
+        rest: the root's part in m, rad elsewhere.
+    """
+    scalars, tangents = coords.split_v(rest)
+    turns, joints = tangents[: -len(room.r)], tangents[-len(room.r) :]
+    used = room.used(room.r + inverse_right_jacobian(room.r, joints))
+    joints = joints * _shortened(used)[:, None]
+    away = jnp.sqrt(jnp.sum(scalars**2) + 1e-12) / ROOT_ROOM
+    return coords.join_v(scalars * _shortened(away), jnp.concatenate([turns, joints]))
+
+
+def clip(coords: quat.Coordinates, room: Room, u: Array) -> Array:
+    """The displacement [nq] with q_m (+) u in its ranges; unchanged where it is."""
+    scalars, quats = coords.split_q(u)
+    turns, joints = quats[: -len(room.r)], quats[-len(room.r) :]
+    r = room.turned(joints)
+    inside = jnp.clip(r, room.lower, room.upper)
+    moved = quat.mul(quat.inv(room.pose), quat.exp(inside))
+    outside = _square(inside - r) > 1e-12
+    joints = jnp.where(outside, moved, joints)
+    return coords.join_q(scalars, jnp.concatenate([turns, joints]))
+
+
+def softened(coords: quat.Coordinates, room: Room, u: Array) -> Array:
+    """Whether a displacement [nq] uses more than `LINEAR_SHARE` of a joint's room."""
+    joints = coords.split_q(u)[1][-len(room.r) :]
+    return jnp.any(room.used(room.turned(joints)) > LINEAR_SHARE)
+
+
+def inverse_right_jacobian(r: Array, w: Array) -> Array:
+    """Jr^-1(r) w [..., 3]: how fast log(q) changes from r when q turns with q' = q w.
+
+    I + [r]x / 2 + (1 / a^2 - cot(a / 2) / (2 a)) [r]x^2, a = |r| below 2 pi.
+    """
+    a2 = _square(r)
+    small = a2 < 1e-4
+    a = jnp.sqrt(jnp.where(small, 1.0, a2))
+    large = 1.0 / a**2 - 0.5 / (a * jnp.tan(0.5 * a))
+    factor = jnp.where(small, 1.0 / 12.0, large)
+    once = jnp.cross(r, w)
+    return w + 0.5 * once + factor * jnp.cross(r, once)
+
+
+def _shortened(used: Array) -> Array:
+    """The factor that takes a share of the room, 0 to infinity, to one below 1."""
+    beyond = jnp.maximum(used - LINEAR_SHARE, 0.0) / (1.0 - LINEAR_SHARE)
+    kept = LINEAR_SHARE + (1.0 - LINEAR_SHARE) * beyond / (1.0 + beyond)
+    return jnp.where(beyond > 0.0, kept / jnp.where(beyond > 0.0, used, 1.0), 1.0)
+
+
+def _square(v: Array) -> Array:
+    return jnp.sum(v * v, axis=-1, keepdims=True)
