@@ -366,7 +366,7 @@ def test_a_root_of_more_columns_than_there_are_is_refused(root_dofs):
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("velocity", "guessed"),
+        ("law", "guessed"),
         ("response_time", 0.0),
         ("damping", -1e-4),
         ("joint_return_stiffness", math.inf),

@@ -84,6 +84,10 @@ class Task:
         """Whether the soles stand on the ground plane."""
         return True
 
+    def quiet(self) -> Task:
+        """The same without disturbances at random; itself where it has none."""
+        return self
+
     def first_reference(
         self, key: Array, references: References, begin: bool
     ) -> RefState:

@@ -62,6 +62,10 @@ class Push(Task):
     distance: float = 0.8
     """Distance of the ball from the root at the release, m."""
 
+    def quiet(self) -> Push:
+        """Nobody throws."""
+        return dataclasses.replace(self, interval=1e9)
+
     def extend(self, spec: mujoco.MjSpec) -> None:
         """A ball that touches the character's trunk, head and upper arms."""
         ball = spec.worldbody.add_body(name="ball", pos=list(AWAY))

@@ -71,6 +71,10 @@ class SustainedPush(Task):
     step, m.
     With a path that did not wait, most episodes ended where it was lost."""
 
+    def quiet(self) -> SustainedPush:
+        """Nobody pushes."""
+        return dataclasses.replace(self, strength=(0.0, 0.0))
+
     def first_reference(
         self, key: Array, references: References, begin: bool
     ) -> RefState:
