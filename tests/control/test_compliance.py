@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -319,7 +320,8 @@ def test_no_force_decays_to_the_reference_and_takes_the_velocity_along():
 @pytest.mark.parametrize("dt", [1e-4, 1.0 / 30.0, 1.0, 1e3])
 def test_return_is_stable_at_any_step(dt):
     tangent = jnp.asarray(np.random.default_rng(6).normal(0.0, 1.0, MODEL.nv))
-    displacement = compliance.Displacement(
+    displacement = dataclasses.replace(
+        REST,
         u=quat.exp_map(COORDS, tangent).astype(jnp.float32),
         ud=jnp.asarray(10.0 * tangent, jnp.float32),
     )

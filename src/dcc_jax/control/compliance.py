@@ -5,12 +5,13 @@ for dq_bar/dx = alpha J^T L, L = (J J^T)^-1, and gets Eq. (7), K_hat = kp (1 - a
 
     algorithm_1   u' = alpha W J^T L h J M^-1 J^T f      Alg. 1
     measured      u' = alpha W J^T L (xd - xd of q_m)    Eq. (8)
-    admittance    u -> alpha / (1 - alpha) W J^T f / kp  Eq. (6) and (7), solved for u
+    admittance    u = alpha y, y -> J^T f / (kp (1 - alpha))   Eq. (6) and (7)
 
 Alg. 1 follows the impulse of a force. While a force lasts u creeps, so that there is no
 static stiffness. With measured velocities u rests when the character does; Eq. (7) then
-holds for any weights, as long as every joint is driven by PD. Admittance goes to the
-displacement that Eq. (6) and (7) have at rest, and holds there whatever the motion.
+holds for any weights, as long as every joint is driven by PD. Admittance knows the
+yield y of the joints that Eq. (7) has at rest, takes the share alpha of it that Eq. (6)
+gives to the reference, and leaves the rest to PD, whatever the motion.
 
 The columns of J carry weights (Sec. 5.1), W = diag(w) >= 0. In the first two laws
 L = (J W J^T + damping I)^-1, so that J u' = alpha xd for any positive weights: the
@@ -25,6 +26,7 @@ nv velocities, nq coordinates.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -53,16 +55,18 @@ Array = jax.Array
 
 @flax.struct.dataclass
 class Displacement:
-    """u and its velocity."""
+    """u and its velocity, and what they are a share of."""
 
     u: Array  # [nq], qpos layout: m on the root's translation, quaternions elsewhere
     ud: Array  # [nv], m/s and rad/s, local tangent
+    y: Array  # [nv] m and rad, the yield of `admittance`; zero with the other laws
+    yd: Array  # [nv] m/s and rad/s
 
 
 def at_rest(coords: quat.Coordinates) -> Displacement:
     """The displacement that changes nothing, u_0 of Alg. 1."""
-    ud = jnp.zeros(coords.nv)
-    return Displacement(u=quat.identity(coords).astype(ud.dtype), ud=ud)
+    ud, y, yd = jnp.zeros((3, coords.nv))
+    return Displacement(u=quat.identity(coords).astype(ud.dtype), ud=ud, y=y, yd=yd)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,12 +204,14 @@ def admittance(
 ) -> Displacement:
     """The displacement one physics step later, on its way to where Eq. (7) has it.
 
-    At rest x = K_hat^-1 f, and Eq. (6) gives u = alpha J^T L x. Joint by joint,
+    At rest the point yields by x = K_hat^-1 f, the joints by y = J^T L x, and Eq. (6)
+    displaces the reference by u = alpha y. For weights W, joint by joint,
 
-        u* = alpha / (1 - alpha) W J^T f / kp,    u'' = w^2 (u* - u) - 2 w u',
+        y* = (1 + W alpha / (1 - alpha)) J^T f / kp,   y'' = w^2 (y* - y) - 2 w y',
+        u = W alpha / (1 - alpha + W alpha) y,
 
     with w^2 the return stiffness. Without a force this is the return of Sec. 5.1.
-    f . (J u*) >= 0, whatever the weights and the room.
+    f . (J y*) >= 0, whatever the weights and the room.
 
     Args:
         controller: of the character.
@@ -213,16 +219,46 @@ def admittance(
         J: Jacobians of the points where the forces act [F, 3, nv], world frame.
         forces: N, world frame [F, 3]; exactly zero where none acts.
         alpha: level of compliance, in [0, 1) (unchecked: it is traced).
-        room: of the reference, that u stays in; see `Controller.room`.
+        room: of the reference, that its yield stays in; see `Controller.room`.
     """
     chex.assert_shape(J, (None, 3, controller.coords.nv))
-    W = jnp.asarray(controller.weights, J.dtype)
+    coords, dt = controller.coords, controller.dt
     torque = jnp.sum(transpose_times(J, forces), axis=0)
-    rest = alpha / (1.0 - alpha) * W * torque / jnp.asarray(controller.kp, J.dtype)
+    softer, share = _softening(controller, alpha, J.dtype)
+    rest = softer * torque / jnp.asarray(controller.kp, J.dtype)
     if room is not None:
-        rest = ranges.bounded(controller.coords, room, rest)
-    ud = _sprung(controller, displacement, rest)
-    return _integrated(controller, displacement, ud, room)
+        rest = ranges.bounded(coords, room, rest)
+    yd = _sprung(controller, displacement.y - rest, displacement.yd)
+    y = displacement.y + dt * yd
+    u = quat.exp_map(coords, share * y)
+    if room is not None:
+        u = ranges.clip(coords, room, u)
+    return Displacement(u=u, ud=share * yd, y=y, yd=yd)
+
+
+def _softening(
+    controller: Controller, alpha: Array, dtype: jnp.dtype
+) -> tuple[Array, Array]:
+    """How much farther than PD alone a joint yields [nv], and u's share of it [nv].
+
+    PD does not drive the root: all that it yields is u.
+    """
+    W = jnp.asarray(controller.weights, dtype)
+    by_u = W * alpha / (1.0 - alpha)
+    driven = np.arange(controller.coords.nv) >= controller.root_dofs
+    softer = by_u + driven
+    return softer, by_u / jnp.where(softer > 0.0, softer, 1.0)
+
+
+def whole_yield(controller: Controller, displacement: Displacement) -> Array:
+    """Where forces have the pose, relative to the reference: q_m (+) this, [nq].
+
+    With `admittance` the yield of Eq. (7), of which u is a part and PD gives way by the
+    rest. The other laws do not know what PD does, and it is u.
+    """
+    if controller.config.law == "admittance":
+        return quat.exp_map(controller.coords, displacement.y)
+    return displacement.u
 
 
 def acting(forces: Array) -> Array:
@@ -249,28 +285,22 @@ def advance(
         active: whether any force acts, a boolean; see `acting`.
         room: of the reference, that u stays in.
     """
-    ud = jnp.where(active, ud, _sprung(controller, displacement, jnp.zeros_like(ud)))
-    return _integrated(controller, displacement, ud, room)
-
-
-def _sprung(controller: Controller, displacement: Displacement, rest: Array) -> Array:
-    """Velocity [nv] a step later of a critically damped spring-damper of unit mass.
-
-    Its rest position is the tangent `rest` [nv]. Implicit Euler, stable for any dt.
-    """
-    dt = controller.dt
-    k = jnp.asarray(controller.return_stiffness, rest.dtype)
-    offset = quat.log_map(controller.coords, displacement.u) - rest
-    return (displacement.ud - dt * k * offset) / (1.0 + dt * jnp.sqrt(k)) ** 2
-
-
-def _integrated(
-    controller: Controller, displacement: Displacement, ud: Array, room: Room | None
-) -> Displacement:
+    offset = quat.log_map(controller.coords, displacement.u)
+    ud = jnp.where(active, ud, _sprung(controller, offset, displacement.ud))
     u = quat.integrate(controller.coords, displacement.u, ud, controller.dt)
     if room is not None:
         u = ranges.clip(controller.coords, room, u)
-    return Displacement(u=u, ud=ud)
+    return dataclasses.replace(displacement, u=u, ud=ud)
+
+
+def _sprung(controller: Controller, offset: Array, speed: Array) -> Array:
+    """Velocity [nv] a step later of a critically damped spring-damper of unit mass.
+
+    It is `offset` [nv] away from its rest. Implicit Euler, stable for any dt.
+    """
+    dt = controller.dt
+    k = jnp.asarray(controller.return_stiffness, offset.dtype)
+    return (speed - dt * k * offset) / (1.0 + dt * jnp.sqrt(k)) ** 2
 
 
 def _laplacian(

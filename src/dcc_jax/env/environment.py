@@ -186,6 +186,7 @@ class Environment:
                 self.config.control_steps,
                 self.kinematics.coords,
                 end.displacement.u,
+                compliance.whole_yield(self.controller, end.displacement),
                 inputs.room,
             ),
         )
@@ -268,7 +269,7 @@ class Environment:
             r_q = outcome.tracking(
                 self.kinematics,
                 q,
-                state.displacement.u,
+                compliance.whole_yield(self.controller, state.displacement),
                 state.reference.qpos,
                 config.reward,
             )

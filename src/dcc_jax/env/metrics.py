@@ -31,7 +31,9 @@ class Metrics:
     power: Array  # [] W, mean of the sum of |torque x speed| over the axes
     displacement: Array  # [] rad, norm of log u over the joints
     root_displacement: Array  # [] m, of u
-    range_share: Array  # [] share of the time in which the joint ranges soften u
+    range_share: (
+        Array  # [] share of the time in which the joint ranges soften the yield
+    )
 
 
 def no_metrics() -> Metrics:
@@ -86,7 +88,12 @@ def add(sums: Sums, force: Array, torque: Array, speed: Array, h: float) -> Sums
 
 
 def metrics(
-    sums: Sums, steps: int, coords: quat.Coordinates, u: Array, room: Room | None
+    sums: Sums,
+    steps: int,
+    coords: quat.Coordinates,
+    u: Array,
+    yielded: Array,
+    room: Room | None,
 ) -> Metrics:
     """Of a control step.
 
@@ -95,6 +102,7 @@ def metrics(
         steps: how many they are.
         coords: of the character.
         u: displacement [55] at its end.
+        yielded: the whole yield [55], `compliance.whole_yield`.
         room: what the reference leaves of the joint ranges.
     """
     contact = jnp.maximum(sums.contact_steps, 1.0)
@@ -109,11 +117,11 @@ def metrics(
         power=sums.power / steps,
         displacement=jnp.sqrt(jnp.sum(jnp.square(log_u[6:])) + 1e-12),
         root_displacement=jnp.sqrt(jnp.sum(jnp.square(log_u[:3])) + 1e-12),
-        range_share=_softened(coords, room, u),
+        range_share=_softened(coords, room, yielded),
     )
 
 
-def _softened(coords: quat.Coordinates, room: Room | None, u: Array) -> Array:
+def _softened(coords: quat.Coordinates, room: Room | None, yielded: Array) -> Array:
     if room is None:
         return jnp.zeros(())
-    return ranges.softened(coords, room, u).astype(u.dtype)
+    return ranges.softened(coords, room, yielded).astype(yielded.dtype)

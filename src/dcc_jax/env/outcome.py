@@ -49,11 +49,20 @@ class FallTest:
 
 
 def tracking(
-    kinematics: Kinematics, q: Array, u: Array, reference: Array, config: RewardConfig
+    kinematics: Kinematics,
+    q: Array,
+    yielded: Array,
+    reference: Array,
+    config: RewardConfig,
 ) -> Array:
-    """How well q (-) u follows the reference [55] in time (Appendix), []."""
+    """How well q (-) yielded follows the reference [55] in time (Appendix), [].
+
+    Departure: the paper takes u off, where `compliance.whole_yield` also has what PD
+    gives way by. Without that a policy is rewarded for working against the yield: it
+    made the hands twice as stiff as Eq. (7) says (`evaluate --drag`).
+    """
     coords = kinematics.coords
-    _, here = coords.split_q(quat.ominus(coords, q, u))
+    _, here = coords.split_q(quat.ominus(coords, q, yielded))
     _, there = coords.split_q(reference)
     error = quat.log(quat.mul(quat.inv(there), here))
     return rewards.tracking_reward(error, config)
