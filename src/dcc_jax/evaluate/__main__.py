@@ -15,6 +15,7 @@ from dcc_jax import command
 from dcc_jax.play import overrides
 
 if TYPE_CHECKING:
+    from dcc_jax.evaluate.drag import DragPlan
     from dcc_jax.evaluate.report import EvaluationPlan
 
 PROGRAM = "dcc_jax.evaluate"
@@ -35,7 +36,9 @@ class Options:
     ]
     """Run directories, or names of policies that ship."""
 
-    episodes: Annotated[int, arg(metavar="N")] = 256
+    episodes: Annotated[
+        int | None, arg(metavar="N", help_behavior_hint="(default: 256; with --drag 2)")
+    ] = None
     """Episodes of each level of compliance."""
 
     alpha: Annotated[
@@ -46,6 +49,9 @@ class Options:
 
     control: bool = True
     """Play each level above 0 also with u off."""
+
+    drag: bool = False
+    """Drag at hands, chest and head instead: the stiffness they have beside Eq. (7)."""
 
     seconds: Annotated[
         float | None, arg(metavar="S", help_behavior_hint="(default: as in training)")
@@ -88,9 +94,11 @@ def _plan(options: Options) -> command.Work:
     for path in (options.json, options.figure):
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
+    if options.drag:
+        return _plan_drag(options)
     plan = report.prepare(
         options.run_dir,
-        options.episodes,
+        256 if options.episodes is None else options.episodes,
         options.alpha,
         options.seed,
         options.seconds,
@@ -99,6 +107,45 @@ def _plan(options: Options) -> command.Work:
         options.control,
     )
     return partial(_measure, plan, options)
+
+
+def _plan_drag(options: Options) -> command.Work:
+    from dcc_jax.evaluate import drag
+    from dcc_jax.play.runs import find_run
+
+    if len(options.run_dir) != 1:
+        raise ValueError(f"--drag takes one RUN_DIR, got {len(options.run_dir)}")
+    run = find_run(options.run_dir[0])
+    plan = drag.prepare(
+        run,
+        options.alpha,
+        2 if options.episodes is None else options.episodes,
+        options.seed,
+        overrides.changes(PROGRAM, options.run_dir[0], options.task),
+    )
+    return partial(_drag, plan, options)
+
+
+def _drag(plan: DragPlan, options: Options) -> None:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from dcc_jax.evaluate import drag, show_drag
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        line = bar.add_task("compiling and dragging", total=None)
+        found = drag.execute(
+            plan, lambda done, total: bar.update(line, completed=done, total=total)
+        )
+    Console(width=None if sys.stdout.isatty() else 400).print(
+        show_drag.table(plan.run.name, found)
+    )
+    if options.json is not None:
+        options.json.write_text(show_drag.to_json(plan.run.name, found))
+        print(f"wrote {options.json}")
+    if options.figure is not None:
+        show_drag.figure(plan.run.name, found, options.figure)
+        print(f"wrote {options.figure}")
 
 
 def _measure(plan: EvaluationPlan, options: Options) -> None:

@@ -9,16 +9,14 @@ Letters: K trials, T control steps, E episodes.
 
 from __future__ import annotations
 
-import dataclasses
-import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import NamedSharding, PartitionSpec
 from scipy.spatial.transform import Rotation
 
 from dcc_jax import quat
@@ -26,48 +24,19 @@ from dcc_jax.character import CONTROL_RATE, Character, compose_scene
 from dcc_jax.control.stiffness import softened_gains, stiffness
 from dcc_jax.env import features
 from dcc_jax.env.environment import Environment
-from dcc_jax.env.observation import ALPHA_ENTRY
-from dcc_jax.env.state import EnvState
 from dcc_jax.evaluate import bootstrap
 from dcc_jax.evaluate.bootstrap import Interval
-from dcc_jax.learn.rollout import Policy
-from dcc_jax.play.pull import PUSH, Hands, Pulled
-from dcc_jax.play.runs import Run, make_environment
+from dcc_jax.evaluate.dragging import BODIES, Play, Trials, program
+from dcc_jax.play.pull import Pulled
+from dcc_jax.play.runs import Run, find_run, make_environment
 
 Array = jax.Array
-Play = Callable[[Run, "Trials", float, int], tuple[np.ndarray, np.ndarray]]
 
-BODIES = ("left_hand", "right_hand", "chest", "head")
-NEWTONS = (20.0, 50.0, 100.0, 150.0)
-DIRECTIONS = np.concatenate([np.eye(3), -np.eye(3)])
 LEVELS = (0.0, 0.16, 0.3, 0.5, 0.7, 0.8)
-BEGIN, RAMP, HOLD = 4.0, 0.5, 2.5  # s
 AVERAGED = 1.0  # s, the last of the hold: a stride of a walk
 NEAR = 0.25
 """A trial whose stiffness is within this share of theory's delivers it (as the field
 counts it)."""
-
-
-@dataclass(frozen=True)
-class Trials:
-    """What is tried in one program: first every episode without a force."""
-
-    episode: np.ndarray  # [K]
-    body: np.ndarray  # [K] index into BODIES, -1: no force
-    force: np.ndarray  # [K, 3] N, world
-
-    @classmethod
-    def of(cls, episodes: int) -> Trials:
-        """Every body, direction and force in every episode."""
-        rows = [(e, -1, np.zeros(3)) for e in range(episodes)]
-        rows += [
-            (e, b, n * d)
-            for e, b, n, d in itertools.product(
-                range(episodes), range(len(BODIES)), NEWTONS, DIRECTIONS
-            )
-        ]
-        episode, body, force = zip(*rows, strict=True)
-        return cls(np.array(episode), np.array(body), np.stack(force))
 
 
 @dataclass(frozen=True)
@@ -80,58 +49,112 @@ class Drag:
     newtons: np.ndarray  # [K]
     measured: np.ndarray  # [K] N/m, force over the yield along it; NaN where it fell
     theory: np.ndarray  # [K] N/m, by Eq. (7) and the weights
-    fell: np.ndarray  # [K] bool
+    fell: np.ndarray  # [K] bool, in it or in the same episode without a force
 
-    def share_near(self, bodies: tuple[str, ...]) -> Interval:
-        """Of the trials at these bodies, those within `NEAR` of theory."""
-        at = np.isin(self.body, [BODIES.index(b) for b in bodies]) & ~self.fell
-        with np.errstate(invalid="ignore"):
-            off = np.abs(self.measured[at] / self.theory[at] - 1.0)
-        return bootstrap.share(off < NEAR)
+    def at(self, body: str) -> np.ndarray:
+        """The trials at a body that ended upright, indices."""
+        return np.flatnonzero((self.body == BODIES.index(body)) & ~self.fell)
 
-    def median(self, body: str) -> tuple[float, float]:
-        """Median stiffness at a body, N/m: measured, by theory."""
-        at = (self.body == BODIES.index(body)) & ~self.fell
-        return float(np.median(self.measured[at])), float(np.median(self.theory[at]))
+    def share_near(self, body: str) -> Interval:
+        """Of the trials at a body, those within `NEAR` of theory."""
+        at = self.at(body)
+        if not len(at):
+            return Interval(np.nan, np.nan, np.nan)
+        return bootstrap.share(np.abs(self.measured[at] / self.theory[at] - 1.0) < NEAR)
+
+    def stiffness(self, body: str) -> Interval:
+        """Median of the measured stiffness at a body, N/m."""
+        at = self.at(body)
+        if not len(at):
+            return Interval(np.nan, np.nan, np.nan)
+        again = self.measured[at][bootstrap.draws(len(at))]
+        low, high = np.percentile(np.median(again, axis=1), [2.5, 97.5])
+        return Interval(float(np.median(self.measured[at])), float(low), float(high))
+
+    def expected(self, body: str) -> float:
+        """Median of the theoretical stiffness over the same trials, N/m."""
+        at = self.at(body)
+        return float(np.median(self.theory[at])) if len(at) else np.nan
+
+
+@dataclass(frozen=True)
+class DragPlan:
+    """A drag that is about to begin: its input is checked."""
+
+    run: Run
+    environment: Environment
+    alpha: Sequence[float]
+    trials: Trials
+    seed: int
 
 
 def drag(
-    run: Run, alpha: tuple[float, ...], episodes: int, seed: int = 0, **task: object
+    run_dir: str | Path,
+    alpha: Sequence[float] | None = None,
+    episodes: int = 2,
+    seed: int = 0,
+    task: Mapping[str, Any] | None = None,
 ) -> list[Drag]:
     """Drags a run's character about at each level of compliance.
 
     Args:
-        run: whose policy acts; a task's own disturbances are off.
-        alpha: levels of compliance.
+        run_dir: a run directory, or a policy that ships; a task's own disturbances at
+            random are off.
+        alpha: levels of compliance; None: those of `LEVELS` that it was trained with.
         episodes: of each trial, with other initial states and motions.
         seed: of everything that is drawn.
-        task: other parameters of the run's task.
+        task: other parameters of the run's task, `{"gaits.speeds": (0.0,)}`.
 
     Raises:
-        ValueError: an alpha that the law cannot have, unknown parameters.
+        ValueError: naming the argument, its value and what is allowed.
     """
-    for level in alpha:
+    return execute(prepare(find_run(run_dir), alpha, episodes, seed, task))
+
+
+def prepare(
+    run: Run,
+    alpha: Sequence[float] | None,
+    episodes: int,
+    seed: int,
+    task: Mapping[str, Any] | None,
+) -> DragPlan:
+    """Checks everything a user can get wrong; arguments as of `drag`."""
+    if episodes < 1:
+        raise ValueError(f"episodes must be 1 or more, got {episodes}")
+    low, high = run.alphas
+    levels = [x for x in LEVELS if low <= x <= high] if alpha is None else list(alpha)
+    for level in levels:
         run.config.env.compliance.check_alpha(level)
-    changed = run.config.with_({f"task.{name}": value for name, value in task.items()})
+    changes = {f"task.{name}": value for name, value in (task or {}).items()}
+    changed = run.config.with_(changes)
     environment = make_environment(run, Pulled(changed.task.quiet()))
-    trials = Trials.of(episodes)
-    play = _program(environment)
-    return [
-        _measured(environment.scene.character, trials, level, run, play, seed)
-        for level in alpha
-    ]
+    return DragPlan(run, environment, levels, Trials.of(episodes), seed)
 
 
-def slope(drags: list[Drag], body: str) -> float:
+def execute(
+    plan: DragPlan, progress: Callable[[int, int], None] = lambda done, total: None
+) -> list[Drag]:
+    """Drags and measures; `progress` is told levels done and to be done."""
+    play, found = program(plan.environment), []
+    for level in plan.alpha:
+        progress(len(found), len(plan.alpha))
+        found.append(_measured(plan, level, play))
+    return found
+
+
+def slope(drags: Sequence[Drag], body: str) -> float:
     """Of log measured over log theoretical median stiffness at a body, over alpha."""
-    found, expected = np.log(np.array([d.median(body) for d in drags])).T
-    return float(np.polyfit(expected, found, 1)[0])
+    found = np.log([d.stiffness(body).value for d in drags])
+    expected = np.log([d.expected(body) for d in drags])
+    good = np.isfinite(found) & np.isfinite(expected)
+    if good.sum() < 2:
+        return np.nan
+    return float(np.polyfit(expected[good], found[good], 1)[0])
 
 
-def _measured(
-    character: Character, trials: Trials, alpha: float, run: Run, play: Play, seed: int
-) -> Drag:
-    q, ended = play(run, trials, alpha, seed)  # [T, K, 55], [K]
+def _measured(plan: DragPlan, alpha: float, play: Play) -> Drag:
+    character, trials = plan.environment.scene.character, plan.trials
+    q, ended = play(plan.run, trials, alpha, plan.seed)  # [T, K, 55], [K]
     q = q[-round(AVERAGED * CONTROL_RATE) :]
     pulled = trials.body >= 0
     body, force, episode = trials.body[pulled], trials.force[pulled], trials.episode
@@ -186,91 +209,3 @@ def _compliances(character: Character, q: np.ndarray, alpha: float) -> np.ndarra
             K = stiffness(model, pose, BODIES[b], point, kp)
             found[e, b] += np.linalg.inv(K) / len(poses)
     return found
-
-
-def _program(environment: Environment) -> Play:
-    """Plays all trials of a level; compiled once."""
-    scene, steps = environment.scene, round((BEGIN + RAMP + HOLD) * CONTROL_RATE)
-    devices = jax.devices()
-    mesh = jax.make_mesh((len(devices),), ("env",), devices=devices)
-    split, over_time = PartitionSpec("env"), PartitionSpec(None, "env")
-    ids = np.array([scene.body(name) for name in BODIES])
-    centres = np.array([scene.model.body_ipos[i] for i in ids])
-
-    def reset(key: Array, body: Array, alpha: Array) -> EnvState:
-        state = environment.reset(jax.random.fold_in(key, 0), alpha)
-        at, place = jnp.asarray(ids)[body], jnp.asarray(centres, jnp.float32)[body]
-        hands = state.task.hands
-        hands = dataclasses.replace(
-            hands,
-            body=hands.body.at[PUSH].set(at),
-            point=hands.point.at[PUSH].set(place),
-        )
-        return _with_hands(state, hands)
-
-    def dragged(state: EnvState, force: Array) -> EnvState:
-        share = jnp.clip((state.time - BEGIN) / RAMP, 0.0, 1.0)
-        hands = state.task.hands
-        force_w = hands.force_w.at[PUSH].set(share * force)
-        return _with_hands(state, dataclasses.replace(hands, force_w=force_w))
-
-    def episodes(
-        policy: Policy,
-        keys: Array,
-        body: Array,
-        force: Array,
-        alpha: Array,
-        told: Array,
-    ) -> tuple[Array, Array]:
-        def step(carry: tuple[EnvState, Array], time: Array):
-            state, ended = carry
-            action = policy.mean(state.obs.at[:, ALPHA_ENTRY].set(told))
-            draws = jax.vmap(lambda key: jax.random.fold_in(key, time))(keys)
-            state = jax.vmap(dragged)(state, force)
-            state = jax.vmap(environment.step)(draws, state, action)
-            ended = ended | state.terminated
-            q = jax.vmap(scene.character_qpos)(state.body.qpos)
-            return (state, ended), q
-
-        start = jax.vmap(reset)(keys, body, alpha)
-        carry = start, jnp.zeros(len(keys), bool)
-        (_, ended), q = jax.lax.scan(step, carry, 1 + jnp.arange(steps))
-        return q, ended
-
-    program = jax.jit(
-        jax.shard_map(
-            episodes,
-            mesh=mesh,
-            in_specs=(PartitionSpec(), split, split, split, split, split),
-            out_specs=(over_time, split),
-            check_vma=False,
-        )
-    )
-
-    def play(
-        run: Run, trials: Trials, alpha: float, seed: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        count = len(trials.body)
-        filled = np.resize(np.arange(count), -(-count // len(devices)) * len(devices))
-        keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(seed)))(
-            trials.episode[filled]
-        )
-        level = np.full(len(filled), alpha, np.float32)
-        given = jax.device_put(
-            (
-                keys,
-                np.maximum(trials.body[filled], 0),
-                trials.force[filled].astype(np.float32),
-                level,
-                np.clip(level, *run.alphas),
-            ),
-            NamedSharding(mesh, split),
-        )
-        q, ended = program(run.policy, *given)
-        return np.asarray(q)[:, :count], np.asarray(ended)[:count]
-
-    return play
-
-
-def _with_hands(state: EnvState, hands: Hands) -> EnvState:
-    return dataclasses.replace(state, task=dataclasses.replace(state.task, hands=hands))

@@ -1,0 +1,115 @@
+"""drag.py: stiffness out of coordinates that are known."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+
+from dcc_jax.character import asset_path, compose_scene, load_character
+from dcc_jax.control.stiffness import softened_gains
+from dcc_jax.evaluate import drag, show_drag
+from dcc_jax.evaluate.dragging import BODIES, DIRECTIONS, NEWTONS, Trials
+from dcc_jax.motion.clip import load_clip
+
+CHARACTER = load_character()
+MODEL = compose_scene(CHARACTER, floor=False)
+STEPS = 90
+POSES = load_clip(asset_path("motions/stand.npz")).qpos
+
+
+def yielding(factor: float):
+    """Episodes of a character that yields `factor` times as far as Eq. (7) says.
+
+    It also drifts over the ground and turns with a force, which is no yield of a body.
+    """
+
+    def play(run, trials, alpha, seed):
+        kp = softened_gains(CHARACTER.kp, CHARACTER.column_weight, alpha)
+        q = np.zeros((STEPS, len(trials.body), MODEL.nq))
+        data, J = mujoco.MjData(MODEL), np.zeros((3, MODEL.nv))
+        for k, (episode, body, force) in enumerate(
+            zip(trials.episode, trials.body, trials.force, strict=True)
+        ):
+            data.qpos[:] = POSES[7 * episode]
+            tangent = np.zeros(MODEL.nv)
+            if body >= 0:
+                mujoco.mj_forward(MODEL, data)
+                at = MODEL.body(BODIES[body]).id
+                mujoco.mj_jac(MODEL, data, J, None, data.xipos[at], at)
+                tangent[6:] = factor * (J.T @ force)[6:] / kp[6:]
+                tangent[:3] = force / 1000.0
+            pose = POSES[7 * episode].astype(float)
+            mujoco.mj_integratePos(MODEL, pose, tangent, 1.0)
+            q[:, k] = pose
+        return q, np.zeros(len(trials.body), bool)
+
+    return play
+
+
+def measured(alpha: float, factor: float = 1.0) -> drag.Drag:
+    environment = SimpleNamespace(scene=SimpleNamespace(character=CHARACTER))
+    trials = Trials.of(2)
+    # Small, so that Eq. (7) is linear.
+    trials = Trials(trials.episode, trials.body, 0.05 * trials.force)
+    plan = SimpleNamespace(environment=environment, trials=trials, run=None, seed=0)
+    return drag._measured(plan, alpha, yielding(factor))
+
+
+def test_who_yields_by_eq_7_is_as_stiff_as_theory_says():
+    found = measured(0.5)
+    soft = found.theory < 1e4  # elsewhere it yields by less than single precision
+    assert soft.mean() > 0.5
+    np.testing.assert_allclose(found.measured[soft], found.theory[soft], rtol=0.03)
+    for body in BODIES:
+        assert found.share_near(body).value > 0.9
+        value = found.stiffness(body)
+        assert value.low <= value.value <= value.high
+        assert value.value == pytest.approx(found.expected(body), rel=0.02)
+
+
+def test_who_yields_half_as_far_is_twice_as_stiff_and_not_near():
+    found = measured(0.5, 0.5)
+    soft = found.theory < 1e4
+    np.testing.assert_allclose(found.measured[soft], 2 * found.theory[soft], rtol=0.03)
+    assert found.share_near("left_hand").value == 0.0
+
+
+def test_slope_is_one_where_theory_holds_and_zero_where_alpha_does_nothing():
+    levels = (0.0, 0.5, 0.8)
+    assert drag.slope([measured(a) for a in levels], "left_hand") == pytest.approx(
+        1.0, abs=0.02
+    )
+    # Yields as at alpha 0 whatever it is told: 1 / (1 + alpha / (1 - alpha)) as far.
+    stiff = [measured(a, 1.0 - a) for a in levels]
+    assert abs(drag.slope(stiff, "chest")) < 0.1
+
+
+def test_every_body_direction_and_force_is_tried_in_every_episode():
+    trials = Trials.of(3)
+    assert len(trials.body) == 3 * (1 + len(BODIES) * len(NEWTONS) * len(DIRECTIONS))
+    alone = trials.body < 0
+    assert list(trials.episode[alone]) == [0, 1, 2] and not trials.force[alone].any()
+    assert len({tuple(f) for f in trials.force[~alone]}) == 6 * len(NEWTONS)
+
+
+def test_who_fell_does_not_count():
+    found = measured(0.5)
+    found.fell[found.body == 0] = True
+    assert np.isnan(found.stiffness(BODIES[0]).value)
+    assert np.isnan(found.share_near(BODIES[0]).value)
+    assert found.share_near(BODIES[1]).value > 0.9
+
+
+def test_table_json_and_figure_tell_the_same(tmp_path: Path):
+    drags = [measured(0.0), measured(0.5)]
+    assert show_drag.table("run", drags).row_count == len(BODIES) * 3
+    data = json.loads(show_drag.to_json("run", drags))
+    assert [level["alpha"] for level in data["levels"]] == [0.0, 0.5]
+    assert len(data["levels"][0]["measured"]) == len(drags[0].measured)
+    show_drag.figure("run", drags, tmp_path / "drag.png")
+    assert (tmp_path / "drag.png").stat().st_size > 10_000
