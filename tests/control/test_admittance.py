@@ -194,3 +194,22 @@ def test_more_than_half_of_a_joints_room_is_reported():
 
     assert not ranges.softened(COORDS, room, turned(0.45))
     assert ranges.softened(COORDS, room, turned(0.55))
+
+
+def test_up_to_the_greatest_alpha_a_force_is_yielded_to_in_full():
+    q_m = load_clip(asset_path("motions/run_cycle.npz")).qpos[5]
+    J, force = jacobian(q_m, HAND)[None], np.array([[0.0, 60.0, 40.0]])
+    given = [jnp.asarray(x, jnp.float32) for x in (q_m, J, force)]
+    alpha = float(compliance.greatest_alpha(CONTROLLER, *given))
+    assert 0.05 < alpha < 0.9
+    kp = np.where(CHARACTER.kp > 0.0, CHARACTER.kp, 2000.0)
+
+    def shortened(alpha: float) -> bool:
+        softer = 1.0 + CHARACTER.column_weight * alpha / (1.0 - alpha)
+        rest = jnp.asarray(softer * (J[0].T @ force[0]) / kp, jnp.float32)
+        rest = rest.at[:6].set(0.0)
+        kept = ranges.bounded(COORDS, CONTROLLER.room(given[0]), rest)
+        return bool(np.abs(kept - rest).max() > 1e-5)
+
+    assert not shortened(alpha - 0.01)
+    assert shortened(alpha + 0.01)

@@ -28,20 +28,17 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 
 import chex
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from dcc_jax import quat
-from dcc_jax.character import Character
 from dcc_jax.control import ranges
-from dcc_jax.control.config import ComplianceConfig
-from dcc_jax.control.ranges import JointRanges, Room
+from dcc_jax.control.controller import Controller, Displacement, at_rest
+from dcc_jax.control.ranges import Room
 from dcc_jax.control.small_matrix import (
     norm,
     shorten,
@@ -50,72 +47,20 @@ from dcc_jax.control.small_matrix import (
     transpose_times,
 )
 
+__all__ = [
+    "Controller",
+    "Displacement",
+    "acting",
+    "admittance",
+    "advance",
+    "algorithm_1",
+    "at_rest",
+    "greatest_alpha",
+    "measured",
+    "whole_yield",
+]
+
 Array = jax.Array
-
-
-@flax.struct.dataclass
-class Displacement:
-    """u and its velocity, and what they are a share of."""
-
-    u: Array  # [nq], qpos layout: m on the root's translation, quaternions elsewhere
-    ud: Array  # [nv], m/s and rad/s, local tangent
-    y: Array  # [nv] m and rad, the yield of `admittance`; zero with the other laws
-    yd: Array  # [nv] m/s and rad/s
-
-
-def at_rest(coords: quat.Coordinates) -> Displacement:
-    """The displacement that changes nothing, u_0 of Alg. 1."""
-    ud, y, yd = jnp.zeros((3, coords.nv))
-    return Displacement(u=quat.identity(coords).astype(ud.dtype), ud=ud, y=y, yd=yd)
-
-
-@dataclass(frozen=True, eq=False)
-class Controller:
-    """What stays the same from step to step.
-
-    Raises:
-        ValueError: `root_dofs` outside [0, nv].
-    """
-
-    config: ComplianceConfig
-    coords: quat.Coordinates  # the layout of u
-    weights: np.ndarray | Array  # [nv] of J's columns, not negative
-    dt: float  # physics step, s
-    kp: np.ndarray | Array  # [nv] N m/rad, N/m; positive where the weight is
-    root_dofs: int = 6  # how many of the first columns are the root's
-    ranges: JointRanges | None = None  # None: nothing bounds u
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.root_dofs <= self.coords.nv:
-            raise ValueError(
-                f"root_dofs must be in [0, {self.coords.nv}], got {self.root_dofs}"
-            )
-
-    @classmethod
-    def of(
-        cls,
-        config: ComplianceConfig,
-        character: Character,
-        coords: quat.Coordinates,
-        dt: float,
-    ) -> Controller:
-        """Of a character, with its weights, gains and joint ranges."""
-        kp = character.kp.copy()
-        kp[:6] = character.scale * config.root_stiffness
-        limits = JointRanges(character.lower, character.upper)
-        weights = character.column_weight
-        return cls(config, coords, weights, dt, kp=kp, ranges=limits)
-
-    @property
-    def return_stiffness(self) -> np.ndarray:
-        """Spring constants [nv] of the return, 1/s^2."""
-        stiffness = np.full(self.coords.nv, self.config.joint_return_stiffness)
-        stiffness[: self.root_dofs] = self.config.root_return_stiffness
-        return stiffness
-
-    def room(self, q_m: Array) -> Room | None:
-        """What a reference q_m [nq] leaves of the joint ranges to u."""
-        return None if self.ranges is None else self.ranges.room(self.coords, q_m)
 
 
 def algorithm_1(
@@ -234,6 +179,32 @@ def admittance(
     if room is not None:
         u = ranges.clip(coords, room, u)
     return Displacement(u=u, ud=share * yd, y=y, yd=yd)
+
+
+def greatest_alpha(
+    controller: Controller, q_m: Array, J: Array, forces: Array
+) -> Array:
+    """The level [] up to which `admittance` yields to constant forces in full.
+
+    Beyond it some joint would use more than `ranges.LINEAR_SHARE` of its room, and the
+    yield is shortened. 0 where PD alone does.
+
+    Args:
+        controller: of the character, with joint ranges.
+        q_m: the reference [nq].
+        J: Jacobians of the points where the forces act [F, 3, nv], world frame.
+        forces: N, world frame [F, 3].
+    """
+    room = controller.room(q_m)
+    assert room is not None
+    torque = jnp.sum(transpose_times(J, forces), axis=0)
+    alone = torque / jnp.asarray(controller.kp, J.dtype)
+    # A joint that yields n times as far as by PD alone has 1 + W alpha / (1 - alpha)
+    # = n.
+    farther = ranges.LINEAR_SHARE / ranges.used(controller.coords, room, alone)
+    W = jnp.asarray(controller.weights, J.dtype)[controller.coords.quat_dof[1:, 0]]
+    odds = jnp.min(jnp.maximum(farther - 1.0, 0.0) / W)
+    return jnp.minimum(1.0 - 1.0 / (1.0 + odds), controller.config.greatest_alpha)
 
 
 def _softening(

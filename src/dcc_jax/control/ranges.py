@@ -84,10 +84,15 @@ def bounded(coords: quat.Coordinates, room: Room, rest: Array) -> Array:
     """
     scalars, tangents = coords.split_v(rest)
     turns, joints = tangents[: -len(room.r)], tangents[-len(room.r) :]
-    used = room.used(room.r + inverse_right_jacobian(room.r, joints))
-    joints = joints * _shortened(used)[:, None]
+    joints = joints * _shortened(used(coords, room, rest))[:, None]
     away = jnp.sqrt(jnp.sum(scalars**2) + 1e-12) / ROOT_ROOM
     return coords.join_v(scalars * _shortened(away), jnp.concatenate([turns, joints]))
+
+
+def used(coords: quat.Coordinates, room: Room, tangent: Array) -> Array:
+    """Share of its room [J] that each joint of a displacement's tangent [nv] uses."""
+    joints = coords.split_v(tangent)[1][-len(room.r) :]
+    return room.used(room.r + inverse_right_jacobian(room.r, joints))
 
 
 def clip(coords: quat.Coordinates, room: Room, u: Array) -> Array:
