@@ -152,13 +152,23 @@ def _loop(run: Run, progress: logs.Progress, stop: StopSignal) -> TrainResult:
 def _prepared(
     run: Run, say: Callable[[str], None]
 ) -> tuple[TrainState, learner.Update]:
-    """The first state and the compiled update, which compile side by side."""
+    """The first state and the compiled update, which compile side by side.
+
+    One after the other they are traced: jax shares what it has traced, and where two
+    threads race for that, the program is another one at every start, which no compile
+    cache holds.
+    """
+    say(f"compiling for {run.mesh.size} {jax.default_backend()} device(s) ...")
+    began = time.perf_counter()
     init = learner.make_init(run.environment, run.config, run.mesh)
     template = jax.eval_shape(init, jax.random.key(run.config.seed), None)
+    lowered = _lowered(run, template)
     with ThreadPoolExecutor(1) as beside:
-        update = beside.submit(_compiled, run, template, say)
+        update = beside.submit(lowered.compile)
         state = _first_state(run, init, template, say)
-        return state, update.result()
+        compiled = update.result()
+    say(f"compiled in {time.perf_counter() - began:.1f} s")
+    return state, compiled
 
 
 def _first_state(
@@ -178,11 +188,8 @@ def _first_state(
     return init(key, None)
 
 
-def _compiled(
-    run: Run, template: TrainState, say: Callable[[str], None]
-) -> learner.Update:
-    say(f"compiling for {run.mesh.size} {jax.default_backend()} device(s) ...")
-    began = time.perf_counter()
+def _lowered(run: Run, template: TrainState) -> jax.stages.Lowered:
+    """The update, traced for a state like the template."""
     update = learner.make_update(run.environment, run.config, run.mesh)
     shardings = learner.state_shardings(run.mesh, template)
     sharded = jax.tree.map(
@@ -190,9 +197,7 @@ def _compiled(
         template,
         shardings,
     )
-    compiled = update.lower(sharded).compile()
-    say(f"compiled in {time.perf_counter() - began:.1f} s")
-    return compiled
+    return update.lower(sharded)
 
 
 def _save(run: Run, done: int, state: TrainState) -> None:
