@@ -115,10 +115,16 @@ def metrics(
         contact_torque=jnp.sqrt(sums.contact_torque_square / contact),
         torque_peak=sums.torque_peak,
         power=sums.power / steps,
-        displacement=jnp.sqrt(jnp.sum(jnp.square(log_u[6:])) + 1e-12),
-        root_displacement=jnp.sqrt(jnp.sum(jnp.square(log_u[:3])) + 1e-12),
+        displacement=_norm(log_u[6:]),
+        root_displacement=_norm(log_u[:3]),
         range_share=_softened(coords, room, yielded),
     )
+
+
+def _norm(vector: Array) -> Array:
+    """Exactly 0 of zeros."""
+    square = jnp.sum(jnp.square(vector))
+    return jnp.where(square > 0.0, jnp.sqrt(square + 1e-12), 0.0)
 
 
 def _softened(coords: quat.Coordinates, room: Room | None, yielded: Array) -> Array:
