@@ -32,6 +32,7 @@ class Report:
     """What an evaluation found."""
 
     task: str
+    parameters: dict[str, dict[str, Any]]  # of the task as it was played, by run
     seed: int
     seconds: float
     conditions: list[Condition]
@@ -45,7 +46,7 @@ class Report:
 
     def to_json(self) -> str:
         """Everything as json; numbers that are undefined become null."""
-        return json.dumps(_defined(asdict(self)), indent=1) + "\n"
+        return json.dumps(_defined(asdict(self)), indent=1, default=str) + "\n"
 
 
 def evaluate(
@@ -245,6 +246,10 @@ def _report(parts: list[Part], plan: EvaluationPlan) -> Report:
     resamples = bootstrap.draws(plan.episodes)
     return Report(
         task=task.name,
+        parameters={
+            name: asdict(player.environment.task)
+            for name, player in plan.players.items()
+        },
         seed=plan.seed,
         seconds=plan.seconds,
         conditions=[part.condition for part in parts],
