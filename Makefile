@@ -18,6 +18,9 @@ RUN := runs/trampoline-$(shell date +%Y%m%d-%H%M%S)
 TUPLES := 1638400
 LEVELS := --env.alpha 0 --env.alpha-max 0.04
 
+# Tests that share a compiled program run on one worker (tests/conftest.py).
+WORKERS := -n auto --dist loadgroup --no-loadscope-reorder
+
 .PHONY: setup run test test-all check clean
 
 setup: $(STAMP)
@@ -36,10 +39,10 @@ run: setup
 	$(BIN)/python -m dcc_jax.train --task trampoline $(LEVELS) --resume --run-dir $(RUN)"
 
 test: setup
-	$(BIN)/python -m pytest -n auto --dist loadfile
+	$(BIN)/python -m pytest $(WORKERS)
 
 test-all: setup
-	$(BIN)/python -m pytest -m "slow or not slow" -n auto --dist loadfile
+	DCC_JAX_TEST_OPTIMIZED=1 $(BIN)/python -m pytest -m "slow or not slow" $(WORKERS)
 
 check: setup
 	$(BIN)/ruff format --check .

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import gc
+import os
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
+import quick
 from dcc_jax import runtime
 
+os.environ["XLA_FLAGS"] = quick.flags(os.environ)
+# Tracing makes objects by the million, and few of them are garbage.
+gc.set_threshold(100_000, 50, 50)
 runtime.ensure()
 
 import jax  # noqa: E402
@@ -57,3 +63,19 @@ def compiled_solve(scene: physics.Scene):
         )
 
     return jax.jit(jax.vmap(probe))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests that share programs run on one worker, the longest groups first.
+
+    A group is a file, or what the mark `xdist_group` names.
+    """
+    for item in items:
+        if item.get_closest_marker("xdist_group") is None:
+            item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
+    items.sort(key=lambda item: not _compiles_long(item))
+
+
+def _compiles_long(item: pytest.Item) -> bool:
+    return item.path.parent.name == "tasks" or item.path.name == "test_skills.py"

@@ -3,44 +3,32 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
+import smoke
 from dcc_jax.training import logs
 
-TUPLES = 2 * 16 * 8  # two updates
-COMMAND = (
-    *("-m", "dcc_jax.train", "--task", "push", "--task.speed", "1.0", "1.5"),
-    *("--preset", "smoke", "--train.total-tuples", str(TUPLES), "--run-dir"),
-)
+pytestmark = pytest.mark.xdist_group("push")
+CHANGES = {
+    **smoke.BY_COMMAND["push"],
+    "env.alpha": smoke.ALPHAS[0],
+    "env.alpha_max": smoke.ALPHAS[1],
+    "train.total_tuples": smoke.smoke_config("push").train.total_tuples,
+}
+TALKATIVE = {"JAX_DEBUG_LOG_MODULES": "jax._src.compiler"}
 SCRIPT = f"""
 import sys
 import dcc_jax
 
 config = dcc_jax.make_config("push", preset="smoke")
-config = config.with_({{"task.speed": (1.0, 1.5), "train.total_tuples": {TUPLES}}})
+config = config.with_({CHANGES})
 dcc_jax.train(config, run_dir=sys.argv[1])
 """
-
-
-def _run(*arguments: str) -> str:
-    """What it says on stderr; jax is as an untouched process has it."""
-    settings = ("XLA_FLAGS", "TF_CPP_MIN_LOG_LEVEL")
-    done = subprocess.run(
-        [sys.executable, *arguments],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={k: v for k, v in os.environ.items() if k not in settings},
-        timeout=900,
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    return done.stderr
 
 
 def _comparable(run_dir: Path) -> list[dict[str, float]]:
@@ -51,27 +39,37 @@ def _comparable(run_dir: Path) -> list[dict[str, float]]:
 
 
 @pytest.fixture(scope="module")
-def both(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, str]]:
+def both(
+    smoke_run: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, tuple[Path, str]]:
     """The run directory and stderr of the same run, begun either way."""
-    folder = tmp_path_factory.mktemp("both")
-    paths = {name: folder / name for name in ("command", "python")}
+    command = smoke_run("push")
+    python = tmp_path_factory.mktemp("both") / "python"
     return {
-        "command": (paths["command"], _run(*COMMAND, str(paths["command"]))),
-        "python": (paths["python"], _run("-c", SCRIPT, str(paths["python"]))),
+        "command": (command, command.with_suffix(".said").read_text()),
+        "python": (python, smoke.fresh_python("-c", SCRIPT, str(python), **TALKATIVE)),
     }
 
 
 def test_run_begun_from_python_is_that_of_the_command_bit_for_bit(both):
     command, python = (path for path, _ in both.values())
     assert _comparable(command) == _comparable(python)
-    assert len(_comparable(command)) == 2
+    assert len(_comparable(command)) == smoke.UPDATES
     configs = [json.loads((p / "config.json").read_text()) for p in (command, python)]
     assert configs[0] == configs[1]
-    assert configs[0]["task"]["speed"] == [1.0, 1.5]
+    assert configs[0]["task"]["speed"] == [2.0, 3.5]
     with np.load(command / "policy.npz") as a, np.load(python / "policy.npz") as b:
         assert a.files == b.files
         for name in a.files:
             np.testing.assert_array_equal(a[name], b[name])
+
+
+def test_a_second_start_finds_in_the_cache_what_the_first_has_compiled(both):
+    if not jax.config.jax_compilation_cache_dir:
+        pytest.skip("no compile cache")
+    _, said = both["python"]
+    for program in ("jit_init", "jit_update"):
+        assert f"Persistent compilation cache hit for '{program}'" in said
 
 
 def test_both_say_once_and_alike_how_jax_is_set_up(both):

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+import smoke
 from dcc_jax import quat
 from dcc_jax.config import make_config
 from dcc_jax.play.recording import Motion, displaced
@@ -23,6 +24,7 @@ from dcc_jax.viz import draw
 # The package shows the function of that name; these tests want the module.
 command = importlib.import_module("dcc_jax.render.__main__")
 
+pytestmark = pytest.mark.xdist_group("push")
 SECONDS = 1.5  # as in the tests of the evaluation: one compiled program serves both
 
 
@@ -35,7 +37,9 @@ def push(smoke_run: Callable[[str], Path]) -> Path:
 def plan(push: Path, tmp_path_factory: pytest.TempPathFactory) -> film.FilmPlan:
     folder = tmp_path_factory.mktemp("film")
     mp4, png = folder / "new" / "a.mp4", folder / "a.png"
-    return film.prepare(push, mp4, SECONDS, None, 3, png, None)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(film, "Player", smoke.player)
+        return film.prepare(push, mp4, SECONDS, None, 3, png, None)
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -90,40 +92,47 @@ def test_mass_solve_is_the_dense_one(scene):
     np.testing.assert_allclose(x, dense, atol=2e-6)
 
 
-def test_optimum_satisfies_the_conditions_of_the_convex_problem(shape):
+@pytest.fixture(scope="module")
+def solved(shape) -> Callable[[int, list], tuple[jax.Array, jax.Array]]:
+    """(most iterations, problem) -> accelerations and forces; one program for all."""
+
+    @jax.jit
+    def all_of(most: jax.Array, problem: list) -> tuple[jax.Array, jax.Array]:
+        def one(mass, smooth, J, D, aref, start):
+            rows = contact_solver.Rows(J, D, aref, _num_equality(shape))
+            return contact_solver.newton(shape, mass, smooth, rows, start, most)
+
+        return jax.vmap(one)(*problem)
+
+    return lambda most, problem: all_of(jnp.int32(most), problem)
+
+
+def _num_equality(shape) -> int:
+    return min(5, shape.num_rows)
+
+
+def test_optimum_satisfies_the_conditions_of_the_convex_problem(shape, solved):
     """M a - smooth = J^T f, with f = -D x where active and 0 elsewhere."""
     p = _problem(shape, 1)
-    num_equality = min(5, shape.num_rows)
-
-    def one(mass, smooth, J, D, aref, start):
-        rows = contact_solver.Rows(J, D, aref, num_equality)
-        return contact_solver.newton(shape, mass, smooth, rows, start, 8)
-
     single = [jnp.asarray(value, jnp.float32) for value in p.values()]
-    qacc, force = (np.asarray(x, float) for x in jax.jit(jax.vmap(one))(*single))
+    qacc, force = (np.asarray(x, float) for x in solved(8, single))
     x = np.einsum("bri,bi->br", p["J"], qacc) - p["aref"]
-    active = (x < 0) | (np.arange(shape.num_rows) < num_equality)
+    active = (x < 0) | (np.arange(shape.num_rows) < _num_equality(shape))
     assert 0.2 < active.mean() < 0.9, "both kinds of rows must occur"
     np.testing.assert_allclose(force, -np.where(active, p["D"] * x, 0.0), atol=2e-5)
     balance = np.einsum("bij,bj->bi", p["mass"], qacc) - p["smooth"]
     np.testing.assert_allclose(
         balance, np.einsum("bri,br->bi", p["J"], force), atol=5e-5
     )
-    alone = jax.jit(one)(*(value[0] for value in single))
-    np.testing.assert_allclose(alone[0], qacc[0], atol=2e-5)
+    alike = [jnp.repeat(value[:1], BATCH, axis=0) for value in single]
+    np.testing.assert_allclose(solved(8, alike)[0], qacc[[0] * BATCH], atol=2e-5)
 
 
-def test_iteration_stops_where_it_has_arrived_and_no_environment_notices_others(shape):
+def test_iteration_stops_where_it_has_arrived_and_no_environment_notices_others(
+    shape, solved
+):
     """More iterations allowed, or easier problems beside it: not a bit changes."""
     p = [jnp.asarray(value, jnp.float32) for value in _problem(shape, 3).values()]
-
-    def solved(most: int, problem: list) -> tuple[jax.Array, jax.Array]:
-        def one(mass, smooth, J, D, aref, start):
-            rows = contact_solver.Rows(J, D, aref, min(5, shape.num_rows))
-            return contact_solver.newton(shape, mass, smooth, rows, start, most)
-
-        return jax.jit(jax.vmap(one))(*problem)
-
     qacc, force = solved(20, p)
     np.testing.assert_array_equal(force, solved(50, p)[1])
     assert np.abs(solved(1, p)[1] - force).max() > 1e-3, "one step is not enough"
@@ -152,10 +161,13 @@ def test_limbs_that_touch_each_other_are_solved_together():
             joined, mass, smooth, contact_solver.Rows(J, D, aref, 1), start, 2
         )
 
-    qacc, _ = jax.vmap(one)(*(jnp.asarray(v, jnp.float32) for v in p.values()))
+    single = [jnp.asarray(value, jnp.float32) for value in p.values()]
+    qacc, _ = jax.jit(jax.vmap(one))(*single)
     J, D = p["J"], p["D"][..., None]
     H = p["mass"] + J.swapaxes(1, 2) @ (D * J)
     right = p["smooth"] + np.einsum("bri,br->bi", J, p["D"] * p["aref"])
     np.testing.assert_allclose(
         qacc, np.linalg.solve(H, right[..., None])[..., 0], atol=2e-6
     )
+    alone, _ = jax.jit(one)(*(value[0] for value in single))
+    np.testing.assert_allclose(alone, qacc[0], atol=2e-6)

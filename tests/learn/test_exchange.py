@@ -6,10 +6,10 @@ import pytest
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 from jax.sharding import NamedSharding, PartitionSpec
 
-from dcc_jax import config
+from dcc_jax import config, tasks
 from dcc_jax.learn import discriminator, learner, networks, ppo
 from dcc_jax.learn.exchange import all_gather_tree
-from dcc_jax.training import loop
+from toy import Toy
 
 EXCHANGES = {"psum", "psum_invariant", "all_gather", "pmax", "pmin", "ppermute"}
 LOOPS = {"scan", "while"}
@@ -53,10 +53,12 @@ def _unordered(jaxpr: Jaxpr) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("task", ["push", "door"])  # imitates, and follows in time
-def test_programs_leave_no_exchange_beside_a_loop_with_exchanges(task):
+@pytest.mark.parametrize(("task", "tracks"), [("push", False), ("door", True)])
+def test_programs_leave_no_exchange_beside_a_loop_with_exchanges(task, tracks):
+    """Of tasks that imitate and that follow in time; no environment exchanges."""
     run = config.make_config(task, "smoke")
-    environment = loop.make_environment(run)
+    assert tasks.make_task(task).tracks_reference == tracks
+    environment = Toy(tracks_reference=tracks)
     mesh = learner.make_mesh(run.train)
     init = learner.make_init(environment, run, mesh)
     key = jax.random.key(0)
