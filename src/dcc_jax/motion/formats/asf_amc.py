@@ -77,7 +77,7 @@ def read_amc(
         MotionError: anything wrong with either file.
     """
     figure = read_asf(skeleton)
-    values, degrees, missing = _frames(path, figure)
+    values, degrees, notes = _frames(path, figure)
     local = [
         _rotation(
             bone, values[name], degrees if degrees is not None else figure.degrees
@@ -94,7 +94,6 @@ def read_amc(
             parents.append(node)
             offsets.append(ends[name])
             local.append(Rotation.identity(len(local[0])))
-    notes = tuple(f"{name} is missing from some frames" for name in sorted(missing))
     return demand_finite(
         Motion(
             path=str(path),
@@ -105,7 +104,7 @@ def read_amc(
             quats=world_rotations(tuple(parents), local),
             fps=fps,
             unit=figure.unit,
-            notes=notes,
+            notes=tuple(notes),
         )
     )
 
@@ -130,57 +129,93 @@ def _rotation(bone: Bone, values: np.ndarray, degrees: bool) -> Rotation:
     return frame * turn * frame.inv()
 
 
+class _Table:
+    """The rows of numbers of an AMC file, frame by frame."""
+
+    def __init__(self, path: str | Path, figure: Skeleton) -> None:
+        self.path = path
+        self.sizes = {n: len(bone.dof) for n, bone in figure.bones.items() if bone.dof}
+        self.rows: dict[str, list[list[str]]] = {name: [] for name in figure.bones}
+        self.lines: dict[str, list[int]] = {name: [] for name in figure.bones}
+        self.missing: set[str] = set()
+        self.count = self.first = 0
+
+    def begin(self, number: int, line: int) -> None:
+        """The next frame begins with its number."""
+        self.close(line)
+        self.first = self.first or number
+        if number != self.first + self.count:
+            last = self.first + self.count - 1
+            reason = f"frame {str(number)[:40]} follows frame {last}"
+            raise MotionError(self.path, reason, line)
+        self.count += 1
+
+    def add(self, name: str, values: list[str], line: int) -> None:
+        """The values of a bone in the frame at hand."""
+        if not self.count or len(self.rows[name]) != self.count - 1:
+            raise MotionError(self.path, f"bone {name!r} is out of place", line)
+        if len(values) != self.sizes[name]:
+            reason = f"{name!r} has {len(values)} values, not {self.sizes[name]}"
+            raise MotionError(self.path, reason, line)
+        self.rows[name].append(values)
+        self.lines[name].append(line)
+
+    def close(self, line: int) -> None:
+        """The frame at hand is over: bones that may be missing rest."""
+        lacking = [n for n in self.sizes if len(self.rows[n]) < self.count]
+        for name in lacking:
+            if not _MINOR.search(name):
+                reason = f"frame {self.count} lacks bone {name!r}"
+                raise MotionError(self.path, reason, line)
+            self.missing.add(name)
+            self.rows[name].append(["0"] * self.sizes[name])
+            self.lines[name].append(line)
+
+    def drop_last(self) -> None:
+        """Forgets the frame at hand."""
+        self.count -= 1
+        for name in self.rows:
+            del self.rows[name][self.count :], self.lines[name][self.count :]
+
+
 def _frames(
     path: str | Path, figure: Skeleton
-) -> tuple[dict[str, np.ndarray], bool | None, set[str]]:
-    """Values [T, dof] by bone; are they degrees; which bones some frames lack."""
-    moving = {name: len(bone.dof) for name, bone in figure.bones.items() if bone.dof}
-    columns: dict[str, list[list[str]]] = {name: [] for name in figure.bones}
-    lines: dict[str, list[int]] = {name: [] for name in figure.bones}
-    degrees, count, missing = None, 0, set()
-    first = 0
-    line = 0
+) -> tuple[dict[str, np.ndarray], bool | None, list[str]]:
+    """Values [T, dof] by bone; are they degrees; what to tell the user.
 
-    def close(at: int) -> None:
-        for name, width in moving.items():
-            if len(columns[name]) < count:
-                if not _MINOR.search(name):
-                    raise MotionError(path, f"frame {count} lacks bone {name!r}", at)
-                missing.add(name)
-                columns[name].append(["0"] * width)
-                lines[name].append(at)
-
-    for line, raw in enumerate(read_text(path).splitlines(), 1):
-        words = raw.split()
-        if not words or words[0][0] == "#":
-            continue
-        key = words[0]
-        if key[0] == ":":
-            degrees = {":degrees": True, ":radians": False}.get(key.lower(), degrees)
-        elif key in moving:
-            if not count or len(columns[key]) != count - 1:
-                raise MotionError(path, f"bone {key!r} is out of place", line)
-            if len(words) != moving[key] + 1:
-                reason = f"{key!r} has {len(words) - 1} values, not {moving[key]}"
-                raise MotionError(path, reason, line)
-            columns[key].append(words[1:])
-            lines[key].append(line)
-        elif len(words) == 1 and key.isdecimal():
-            close(line)
-            first = first or int(key)
-            if int(key) != first + count:
-                reason = f"frame {key[:40]} follows frame {first + count - 1}"
-                raise MotionError(path, reason, line)
-            count += 1
-        else:
-            raise MotionError(path, f"unknown bone {key[:40]!r}", line)
-    if not count:
-        raise MotionError(path, "holds no frames", line)
-    close(line)
+    A last frame that is cut is left out: copies of files often end within a line.
+    """
+    table, degrees, line = _Table(path, figure), None, 0
+    lines = [(n, raw.split()) for n, raw in enumerate(read_text(path).splitlines(), 1)]
+    lines = [(n, words) for n, words in lines if words and words[0][0] != "#"]
+    notes = []
+    try:
+        for line, words in lines:
+            key = words[0]
+            if key[0] == ":":
+                unit = {":degrees": True, ":radians": False}
+                degrees = unit.get(key.lower(), degrees)
+            elif key in table.sizes:
+                table.add(key, words[1:], line)
+            elif len(words) == 1 and key.isdecimal():
+                table.begin(int(key[:40]), line)
+            else:
+                raise MotionError(path, f"unknown bone {key[:40]!r}", line)
+        table.close(line)
+    except MotionError:
+        # Only what the end of the file cut off may be wrong.
+        if table.count < 3 or line != lines[-1][0]:
+            raise
+        table.drop_last()
+        notes.append(f"the last frame is cut: {table.count} were taken")
+    if not table.count:
+        raise MotionError(path, "holds no frames", line or 1)
     values = {
-        name: _numbers(path, rows, lines[name], count) for name, rows in columns.items()
+        name: _numbers(path, rows, table.lines[name], table.count)
+        for name, rows in table.rows.items()
     }
-    return values, degrees, missing
+    notes += [f"{name} is missing from some frames" for name in sorted(table.missing)]
+    return values, degrees, notes
 
 
 def _numbers(

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from dcc_jax.motion.formats.bvh_rows import Rows, read_rows
 from dcc_jax.motion.formats.npz import MotionError
 from dcc_jax.motion.formats.skeleton import (
     MAX_NODES,
@@ -16,9 +18,11 @@ from dcc_jax.motion.formats.skeleton import (
     demand_finite,
     world_rotations,
 )
-from dcc_jax.motion.formats.text import Tokens, number, read_text
+from dcc_jax.motion.formats.text import Tokens, read_text
 
 _CHANNEL = re.compile(r"([xyz])(position|rotation)", re.IGNORECASE)
+FEWEST = 12  # joints of a figure; a tree of less is a prop
+_SPARSE = 4  # nodes a channel, above which a file claims more than it can hold
 
 
 @dataclass(frozen=True)
@@ -29,6 +33,7 @@ class _Node:
     parent: int
     offset: np.ndarray  # [3], the file's unit
     channels: tuple[tuple[str, str], ...] = ()
+    end: bool = False
 
 
 def is_bvh(head: str) -> bool:
@@ -36,13 +41,19 @@ def is_bvh(head: str) -> bool:
     return head.lstrip().upper().startswith("HIERARCHY")
 
 
-def read_bvh(path: str | Path) -> Motion:
+def read_bvh(
+    path: str | Path, fps: float | None = None, root: str | None = None
+) -> Motion:
     """Reads a BVH file, in its own axes and unit.
 
     Rotations are products of the channels in the order each joint lists them. Where
     the root has position channels they alone place it; its OFFSET is then ignored,
-    since exporters disagree about what it means. A first row that only shows the
-    zero pose is dropped.
+    since exporters disagree about what it means. Position channels count on any joint.
+
+    Args:
+        path: the file.
+        fps: its frame rate, if the caller knows it.
+        root: which ROOT to take; None: the only one that is a figure.
 
     Raises:
         MotionError: anything wrong with the file.
@@ -54,36 +65,32 @@ def read_bvh(path: str | Path) -> Motion:
     nodes = _hierarchy(Tokens(path, text[: found.start()]))
     first_line = text.count("\n", 0, found.start()) + 1
     channels = sum(len(node.channels) for node in nodes)
-    rows, fps = _rows(path, text[found.start() :], first_line, channels)
-    return demand_finite(_without_rest_row(_motion(str(path), nodes, rows, fps)))
+    if len(nodes) > _SPARSE * channels + 100:
+        raise MotionError(path, f"{len(nodes)} joints have {channels} channels")
+    rows = read_rows(path, text[found.start() :], first_line, channels, fps)
+    kept, notes = _figure(str(path), nodes, root)
+    motion = _motion(str(path), nodes, kept, rows)
+    return demand_finite(motion.noted(*rows.notes, *notes))
 
 
 def _hierarchy(tokens: Tokens) -> list[_Node]:
-    """The tree, parents first; End Sites are nodes named after their parent."""
+    """The trees, parents first; End Sites are nodes named after their parent."""
     tokens.take("HIERARCHY")
     nodes: list[_Node] = []
     open_nodes: list[int] = []
-    while True:
+    while tokens.peek() or open_nodes or not nodes:
         line, word = tokens.line, tokens.take().lower()
-        if word == "}":
-            if not open_nodes:
-                raise MotionError(tokens.path, "a brace closes nothing", line)
+        if word == "}" and open_nodes:
             open_nodes.pop()
-            if not open_nodes:
-                break
             continue
-        parent = open_nodes[-1] if open_nodes else -1
-        if word not in ("joint", "end") and not (word == "root" and not nodes):
+        inside = bool(open_nodes)
+        if word not in ("joint", "end") if inside else word != "root":
             raise MotionError(tokens.path, f"unexpected {word[:40]!r}", line)
-        if word != "root" and parent < 0:
-            raise MotionError(tokens.path, f"{word!r} outside the root", line)
+        parent = open_nodes[-1] if inside else -1
         nodes.append(_node(tokens, word, parent, nodes))
         open_nodes.append(len(nodes) - 1)
         if len(nodes) > MAX_NODES:
             raise MotionError(tokens.path, f"more than {MAX_NODES} joints", line)
-    if tokens.peek():
-        reason = f"{tokens.peek()[:40]!r} after the only root"
-        raise MotionError(tokens.path, reason, tokens.line)
     return nodes
 
 
@@ -96,8 +103,8 @@ def _node(tokens: Tokens, kind: str, parent: int, nodes: list[_Node]) -> _Node:
             raise MotionError(tokens.path, "a joint without its '{'", line)
     tokens.take("{")
     name = f"{nodes[parent].name}_end" if kind == "end" else " ".join(words)
-    if kind != "end" and (not name or any(node.name == name for node in nodes)):
-        raise MotionError(tokens.path, f"joint name {name[:40]!r} is not unique", line)
+    if not name:
+        raise MotionError(tokens.path, "a joint without a name", line)
     tokens.take("OFFSET")
     offset = tokens.numbers(3)
     channels: list[tuple[str, str]] = []
@@ -120,94 +127,104 @@ def _channel(tokens: Tokens) -> tuple[str, str]:
     return match[2].lower(), match[1].lower()
 
 
-def _rows(
-    path: str | Path, text: str, line: int, channels: int
-) -> tuple[np.ndarray, float]:
-    """The numbers [T, channels] of the MOTION section, and the frame rate."""
-    head = re.match(
-        r"\s*MOTION\s+Frames\s*:\s*(\S+)\s+Frame\s+Time\s*:\s*(\S+)",
-        text,
-        re.IGNORECASE,
+def _figure(
+    path: str, nodes: list[_Node], wanted: str | None
+) -> tuple[list[int], tuple[str, ...]]:
+    """The nodes of the tree that is a figure, and what to tell about the others.
+
+    Raises:
+        MotionError: there are several figures, or none has the wanted name.
+    """
+    trees: dict[int, list[int]] = {}
+    roots: list[int] = []
+    for index, node in enumerate(nodes):
+        roots.append(index if node.parent < 0 else roots[node.parent])
+        trees.setdefault(roots[index], []).append(index)
+    names = {root: nodes[root].name for root in trees}
+    if wanted is not None:
+        found = [root for root, name in names.items() if name == wanted]
+    else:
+        found = [r for r, t in trees.items() if len(t) >= FEWEST] or [0]
+    if len(found) != 1:
+        listed = ", ".join(names.values())
+        raise MotionError(path, f"which ROOT of {listed} is meant? say --root NAME")
+    others = [name for root, name in names.items() if root != found[0]]
+    note = f"left out what is no part of the figure: {', '.join(others)}"
+    return trees[found[0]], (note,) if others else ()
+
+
+def _motion(path: str, nodes: list[_Node], kept: list[int], rows: Rows) -> Motion:
+    """Applies the channels of the nodes that are kept."""
+    starts = np.cumsum([0, *(len(node.channels) for node in nodes)])
+    local, places = [], {}
+    for place, index in enumerate(kept):
+        node = nodes[index]
+        values = rows.values[:, starts[index] : starts[index + 1]]
+        local.append(_turn(node, values))
+        shift = _shift(node, values)
+        if shift is not None:
+            places[place] = shift
+    parents = tuple(
+        kept.index(nodes[i].parent) if nodes[i].parent >= 0 else -1 for i in kept
     )
-    if head is None:
-        raise MotionError(path, "MOTION lacks 'Frames:' or 'Frame Time:'", line)
-    claimed = number(path, head[1], line + 1)
-    seconds = number(path, head[2], line + 2)
-    if claimed < 1 or claimed != int(claimed):
-        raise MotionError(path, f"claims {head[1][:40]} frames", line + 1)
-    if not 1e-4 <= seconds <= 1.0:
-        raise MotionError(
-            path, f"frame time {head[2][:40]} s is not credible", line + 2
-        )
-    line += text.count("\n", 0, head.end())
-    words = text[head.end() :].split()
-    if len(words) != int(claimed) * channels:
-        raise MotionError(
-            path,
-            f"claims {int(claimed)} frames of {channels} channels, "
-            f"but holds {len(words)} numbers",
-            line + text.count("\n", head.end()),
-        )
-    try:
-        values = np.array(words, float)
-    except ValueError:
-        values = np.array([np.nan])
-    if not np.isfinite(values).all():
-        tokens = Tokens(path, text[head.end() :], line)
-        tokens.numbers(len(words))
-    return values.reshape(int(claimed), channels), 1.0 / seconds
-
-
-def _motion(path: str, nodes: list[_Node], rows: np.ndarray, fps: float) -> Motion:
-    """Applies the channels."""
-    local, root, column = [], np.zeros((len(rows), 3)), 0
-    for node in nodes:
-        values = rows[:, column : column + len(node.channels)]
-        column += len(node.channels)
-        kinds = [kind for kind, _ in node.channels]
-        if node.parent < 0:
-            root = root + (0.0 if "position" in kinds else node.offset)
-            for (kind, axis), value in zip(node.channels, values.T, strict=True):
-                if kind == "position":
-                    root[:, "xyz".index(axis)] = value
-        order = "".join(axis for kind, axis in node.channels if kind == "rotation")
-        turn = Rotation.identity(len(rows))
-        if order:
-            angles = values[:, [kind == "rotation" for kind in kinds]]
-            turn = Rotation.from_euler(order.upper(), angles, degrees=True)
-        local.append(turn)
-    parents = tuple(node.parent for node in nodes)
-    offsets = np.stack([node.offset for node in nodes])
+    offsets = np.stack([nodes[index].offset for index in kept])
+    root = places.pop(0, np.tile(offsets[0], (len(rows.values), 1)))
     offsets[0] = 0.0
+    for place, shift in places.items():
+        offsets[place] = np.median(shift, axis=0)
+    names, notes = _unique([nodes[index].name for index in kept])
     return Motion(
         path=path,
-        names=tuple(_unique([node.name for node in nodes])),
+        names=names,
         parents=parents,
         offsets=offsets,
         root=root,
         quats=world_rotations(parents, local),
-        fps=fps,
+        fps=rows.fps,
+        notes=notes,
+        moves={k: shift for k, shift in places.items() if np.ptp(shift, axis=0).any()},
     )
 
 
-def _unique(names: list[str]) -> list[str]:
-    """The names with a number added to those that occurred before."""
-    seen: dict[str, int] = {}
+def _turn(node: _Node, values: np.ndarray) -> Rotation:
+    """Rotations [T] of a joint: the product of its channels as listed."""
+    turning = [kind == "rotation" for kind, _ in node.channels]
+    if not any(turning):
+        return Rotation.identity(len(values))
+    order = "".join(axis for kind, axis in node.channels if kind == "rotation")
+    return Rotation.from_euler(order.upper(), values[:, turning], degrees=True)
+
+
+def _shift(node: _Node, values: np.ndarray) -> np.ndarray | None:
+    """Where a joint is in its parent's frame [T, 3]; None: always at its OFFSET.
+
+    Position channels stand for the OFFSET in most programs, in some they are added to
+    it: these stay near zero where a bone is long.
+    """
+    columns = {
+        "xyz".index(axis): values[:, column]
+        for column, (kind, axis) in enumerate(node.channels)
+        if kind == "position"
+    }
+    if not columns:
+        return None
+    shift = np.tile(node.offset, (len(values), 1))
+    for axis, column in columns.items():
+        shift[:, axis] = column
+    middle = np.median(shift, axis=0)
+    apart = np.linalg.norm(middle - node.offset)
+    if node.parent >= 0 and np.linalg.norm(middle) < min(apart, 1e-3 + 0.5 * apart):
+        return node.offset + shift
+    return shift
+
+
+def _unique(names: list[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The names with a number added to those that occurred before, and a note."""
+    seen: Counter[str] = Counter()
     out = []
     for name in names:
-        seen[name] = seen.get(name, 0) + 1
-        out.append(name if seen[name] == 1 else f"{name}_{seen[name]}")
-    return out
-
-
-def _without_rest_row(motion: Motion) -> Motion:
-    """Drops a first row that is no motion: the root unturned and all else far off."""
-    if len(motion.root) < 3:
-        return motion
-    turns = Rotation.from_quat(motion.quats[:3], scalar_first=True)
-    jump = np.median((turns[1].inv() * turns[0]).magnitude())
-    step = np.median((turns[2].inv() * turns[1]).magnitude())
-    if turns[0].magnitude()[0] > 1e-6 or jump < 0.05 + 20.0 * step:
-        return motion
-    rest = motion.part(slice(1, None))
-    return replace(rest, notes=(*motion.notes, "first frame dropped: a T-pose"))
+        seen[name] += 1
+        out.append(name if seen[name] == 1 else f"{name}#{seen[name]}")
+    twice = [n for n, k in seen.items() if k > 1 and not n.endswith("_end")]
+    note = f"several joints are called {', '.join(twice[:10])}"
+    return tuple(out), (note,) if twice else ()

@@ -17,7 +17,10 @@ from dcc_jax.motion.formats.text import read_text
 
 FRAME_SIZE = 44
 MAX_FPS = 240.0
-MAX_FRAMES = 1_000_000
+LEAST_FRAMES = 20_000
+MOST_A_KEY = 50
+"""Unequal durations are met by more frames than keys, but the file's size bounds them:
+at most these, or so many a key."""
 # Our body, parent, attachment (m), column, numbers (1: a hinge about z).
 _NODES = (
     ("pelvis", "", (0.0, 0.0, 0.0), 4, 4),
@@ -116,10 +119,11 @@ def _regular_times(path: str | Path, times: np.ndarray) -> tuple[float, np.ndarr
     steps = np.diff(times)
     if np.ptp(steps) < 1e-3 * steps.mean():
         return float(1.0 / steps.mean()), times
-    fps = float(min(1.0 / steps.min(), MAX_FPS))
+    most = max(LEAST_FRAMES, MOST_A_KEY * len(times))
+    fps = float(min(1.0 / steps.min(), MAX_FPS, most / times[-1]))
+    if fps < 1.0:
+        raise MotionError(path, f"{len(times)} key frames last {times[-1]:.0f} s")
     count = round(times[-1] * fps)
-    if count > MAX_FRAMES:
-        raise MotionError(path, f"would have {count} frames")
     fps = max(count, 1) / float(times[-1])
     return fps, np.arange(max(count, 1) + 1) / fps
 

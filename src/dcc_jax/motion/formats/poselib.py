@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dcc_jax.motion.formats.npz import MotionError, read_npz
+from dcc_jax.motion.formats.npz import MotionError
 from dcc_jax.motion.formats.skeleton import (
     MAX_NODES,
     Motion,
@@ -19,22 +19,20 @@ from dcc_jax.motion.formats.skeleton import (
 _NEEDED = ("node_names", "parent_indices", "local_translation", "root_translation")
 
 
-def is_poselib(data: bytes) -> bool:
-    """Whether a file that begins like this is a zip archive, as `.npz` are."""
-    return data.startswith(b"PK")
-
-
-def read_poselib(path: str | Path) -> Motion:
+def read_poselib(path: str | Path, arrays: Mapping[str, np.ndarray]) -> Motion:
     """Reads a motion of any skeleton, x forward and z up.
 
     Keys: `fps`, `node_names` [J], `parent_indices` [J], `local_translation` [J, 3],
     `root_translation` [T, 3], `rotation_xyzw` [T, J, 4], `is_local` (true: all but the
     root's are relative to the parent).
 
+    Args:
+        path: the file, for errors.
+        arrays: what it holds.
+
     Raises:
         MotionError: anything wrong with the file.
     """
-    arrays = read_npz(path)
     parents = _checked(path, arrays)
     rotation = arrays["rotation_xyzw"].astype(float)
     norms = np.linalg.norm(rotation, axis=-1)
@@ -59,6 +57,7 @@ def read_poselib(path: str | Path) -> Motion:
             root=arrays["root_translation"].astype(float),
             quats=quats,
             fps=float(arrays["fps"]),
+            up="z",
         )
     )
 

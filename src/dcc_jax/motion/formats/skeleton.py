@@ -1,4 +1,4 @@
-"""Motion on the skeleton it was recorded with, and the change to our axes and units.
+"""Motion on the skeleton it was recorded with, in its own axes and unit.
 
 Letters: T frames, J nodes (joints and end points). A node's rotation is its world
 rotation *away from the zero pose*: the pose with every rotation the identity.
@@ -25,8 +25,6 @@ UNITS = {
     "foot": 0.3048,
     "cmu": CMU_UNIT,
 }
-GUESSED_UNITS = ("m", "cm", "mm", "inch", "cmu")
-LEG_LENGTH = (0.55, 1.15)  # m, thigh and shin of a person
 AXES = ("x", "y", "z", "-x", "-y", "-z")
 MAX_NODES = 1000
 
@@ -47,6 +45,8 @@ class Motion:
     loop: bool = False
     roles: Mapping[str, str] = field(default_factory=dict)  # our body: node, if known
     notes: tuple[str, ...] = ()  # what was assumed, for the user
+    moves: Mapping[int, np.ndarray] = field(default_factory=dict)
+    """Offsets [T, 3] of the nodes that shift against their parents, by node."""
 
     def positions(self) -> np.ndarray:
         """World positions [T, J, 3] of all nodes, in the motion's own axes and unit."""
@@ -56,8 +56,13 @@ class Motion:
                 out[:, node] = self.root
             else:
                 turn = Rotation.from_quat(self.quats[:, parent], scalar_first=True)
-                out[:, node] = out[:, parent] + turn.apply(self.offsets[node])
+                offset = self.moves.get(node, self.offsets[node])
+                out[:, node] = out[:, parent] + turn.apply(offset)
         return out
+
+    def turns(self, node: int) -> Rotation:
+        """World rotations [T] of a node away from the zero pose."""
+        return Rotation.from_quat(self.quats[:, node], scalar_first=True)
 
     def rest(self) -> np.ndarray:
         """Positions [J, 3] in the zero pose, the root at the origin."""
@@ -77,7 +82,16 @@ class Motion:
 
     def part(self, frames: slice | np.ndarray) -> Motion:
         """The motion in some of its frames."""
-        return replace(self, root=self.root[frames], quats=self.quats[frames])
+        return replace(
+            self,
+            root=self.root[frames],
+            quats=self.quats[frames],
+            moves={node: move[frames] for node, move in self.moves.items()},
+        )
+
+    def noted(self, *notes: str) -> Motion:
+        """The motion with more to tell the user."""
+        return replace(self, notes=(*self.notes, *notes))
 
 
 def world_rotations(parents: tuple[int, ...], local: list[Rotation]) -> np.ndarray:
@@ -94,7 +108,7 @@ def demand_finite(motion: Motion) -> Motion:
     Raises:
         MotionError: otherwise.
     """
-    parts = (motion.offsets, motion.root, motion.quats)
+    parts = (motion.offsets, motion.root, motion.quats, *motion.moves.values())
     if not all((np.abs(part) < 1e9).all() for part in parts):
         raise MotionError(motion.path, "holds a number that is not finite, or absurd")
     if not (math.isfinite(motion.fps) and 1.0 <= motion.fps <= 10_000.0):
@@ -120,150 +134,9 @@ def rest_on_frame(motion: Motion, frame: int) -> Motion:
         motion,
         offsets=at_parent.apply(motion.offsets),
         quats=quats.as_quat(scalar_first=True),
+        moves={
+            node: at_parent[node].apply(move) for node, move in motion.moves.items()
+        },
     )
 
 
-def leg_length(motion: Motion, bodies: Mapping[str, int]) -> float:
-    """Thigh and shin in the motion's unit, the mean of both sides."""
-    rest = motion.rest()
-    chains = [
-        [rest[bodies[f"{side}_{part}"]] for part in ("thigh", "shin", "foot")]
-        for side in ("left", "right")
-    ]
-    bones = [np.linalg.norm(np.diff(chain, axis=0), axis=1).sum() for chain in chains]
-    return float(np.mean(bones))
-
-
-def in_metres(motion: Motion, bodies: Mapping[str, int], unit: str | None) -> Motion:
-    """The motion in metres.
-
-    Args:
-        motion: as read.
-        bodies: node of each body of ours.
-        unit: the name of the unit; None takes what the file says, or the one that
-            gives a person's legs.
-
-    Raises:
-        MotionError: no unit gives a person's legs.
-    """
-    length = leg_length(motion, bodies)
-    notes = motion.notes
-    if unit is not None:
-        scale = UNITS[unit]
-    elif motion.unit is not None:
-        scale = motion.unit
-    else:
-        fits = [u for u in GUESSED_UNITS if _is_leg(length * UNITS[u])]
-        if not fits:
-            raise MotionError(
-                motion.path,
-                f"legs of {length:.4g} fit no unit of {', '.join(GUESSED_UNITS)}; "
-                "say which with --unit",
-            )
-        scale = UNITS[fits[0]]
-        notes = (*notes, f"unit taken as {fits[0]}: legs of {length * scale:.2f} m")
-    if not _is_leg(length * scale):
-        notes = (*notes, f"legs of {length * scale:.3g} m: is the unit right?")
-    if not length * scale > 1e-6:
-        raise MotionError(motion.path, "the legs have no length")
-    return replace(
-        motion,
-        offsets=motion.offsets * scale,
-        root=motion.root * scale,
-        unit=1.0,
-        notes=notes,
-    )
-
-
-def _is_leg(length: float) -> bool:
-    return LEG_LENGTH[0] <= length <= LEG_LENGTH[1]
-
-
-def in_our_axes(motion: Motion, bodies: Mapping[str, int], up: str | None) -> Motion:
-    """The motion with x forward, y left and z up.
-
-    The zero pose tells which way the figure stands and faces in it. The world's up is
-    the same axis, unless the trunk then points elsewhere most of the time.
-
-    Args:
-        motion: as read.
-        bodies: node of each body of ours.
-        up: the world's upward axis, overriding the guess.
-
-    Raises:
-        MotionError: the zero pose is not that of a standing figure.
-    """
-    rest_axes = _standing_axes(motion, bodies)
-    world_axes, notes = _world_axes(motion, bodies, rest_axes, up)
-    quats = Rotation.from_matrix(world_axes) * Rotation.from_quat(
-        motion.quats, scalar_first=True
-    )
-    quats = quats * Rotation.from_matrix(rest_axes).inv()
-    return replace(
-        motion,
-        offsets=motion.offsets @ rest_axes.T,
-        root=motion.root @ world_axes.T,
-        quats=quats.as_quat(scalar_first=True),
-        up="z",
-        notes=(*motion.notes, *notes),
-    )
-
-
-def _standing_axes(motion: Motion, bodies: Mapping[str, int]) -> np.ndarray:
-    """Rows: forward, left and up of the figure in its zero pose."""
-    rest = motion.rest()
-
-    def mean(part: str) -> np.ndarray:
-        return 0.5 * (rest[bodies[f"left_{part}"]] + rest[bodies[f"right_{part}"]])
-
-    legs = _unit(mean("thigh") - mean("foot"))
-    trunk = _unit(mean("upper_arm") - mean("thigh"))
-    across = rest[bodies["left_thigh"]] - rest[bodies["right_thigh"]]
-    if np.linalg.norm(across) < 1e-9:
-        across = rest[bodies["left_upper_arm"]] - rest[bodies["right_upper_arm"]]
-    up = _nearest_axis(legs)
-    left = _unit(across - up * (across @ up))
-    if legs @ trunk < 0.7 or legs @ up < 0.9 or not left.any():
-        raise MotionError(
-            motion.path,
-            "the zero pose does not stand upright; name a frame that does "
-            "with --rest-frame",
-        )
-    if left @ _nearest_axis(left) > math.cos(math.radians(20.0)):
-        left = _nearest_axis(left)
-    return np.stack([np.cross(left, up), left, up])
-
-
-def _world_axes(
-    motion: Motion, bodies: Mapping[str, int], rest_axes: np.ndarray, up: str | None
-) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Rows of the world's axes, and what to tell the user about them."""
-    pelvis, chest = (
-        Rotation.from_quat(motion.quats[:, bodies[name]], scalar_first=True)
-        for name in ("pelvis", "chest")
-    )
-    trunk = pelvis.apply(rest_axes[2]).mean(0) + chest.apply(rest_axes[2]).mean(0)
-    if up is not None:
-        upward = np.eye(3)[AXES.index(up) % 3] * (1.0 if AXES.index(up) < 3 else -1.0)
-    elif motion.up is not None or trunk @ rest_axes[2] > 0.5 * np.linalg.norm(trunk):
-        return rest_axes, ()
-    else:
-        upward = _nearest_axis(trunk)
-    turn = Rotation.align_vectors([[0.0, 0.0, 1.0]], [rest_axes @ upward])[0]
-    world = turn.as_matrix() @ rest_axes
-    if np.allclose(world, rest_axes):
-        return rest_axes, ()
-    axis = AXES[int(np.argmax(np.concatenate([upward, -upward])))]
-    return world, (f"the world's up is {axis}, unlike the zero pose's",)
-
-
-def _unit(v: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(v)
-    return v / length if length > 1e-9 else np.zeros(3)
-
-
-def _nearest_axis(v: np.ndarray) -> np.ndarray:
-    axis = np.zeros(3)
-    largest = int(np.argmax(np.abs(v)))
-    axis[largest] = math.copysign(1.0, v[largest])
-    return axis

@@ -42,6 +42,55 @@ def number(path: str | Path, token: str, line: int) -> float:
     return value
 
 
+_RATES = (24, 25, 30, 48, 50, 60, 72, 90, 100, 120, 144, 180, 200, 240, 250, 300, 360)
+_FILM = tuple(1000.0 / 1001.0 * rate for rate in (24, 30, 60, 120))  # NTSC
+_WORDS_AT_ONCE = 1 << 20  # characters of text that are split into words at a time
+
+
+def rate_of(token: str, seconds: float) -> float:
+    """The frame rate a time between frames stands for.
+
+    `0.033333` is 30 frames a second and not 30.0003, at which the last of 40 frames
+    would be lost: a usual rate is meant where the digits allow it.
+
+    Args:
+        token: the time as it is written, which tells how far it was rounded.
+        seconds: its value.
+    """
+    digits = token.lower().partition("e")[0].partition(".")[2]
+    rounding = 0.5 * 10.0 ** -len(digits) if "e" not in token.lower() else 0.0
+    slack = min(max(rounding, 1e-4 * seconds), 0.011 * seconds)
+    usual = min((*_RATES, *_FILM), key=lambda rate: abs(1.0 / rate - seconds))
+    return float(usual) if abs(1.0 / usual - seconds) <= slack else 1.0 / seconds
+
+
+def all_numbers(path: str | Path, text: str, first_line: int) -> np.ndarray:
+    """The finite numbers a text consists of, [N].
+
+    A part at a time: a list of words takes ten times the memory of the numbers.
+
+    Raises:
+        MotionError: a word is no finite number.
+    """
+    parts, start = [np.zeros(0)], 0
+    while start < len(text):
+        stop = start + _WORDS_AT_ONCE
+        while stop < len(text) and not text[stop].isspace():
+            stop += 1
+        try:
+            part = np.array(text[start:stop].split(), float)
+        except ValueError:
+            part = np.array([np.nan])
+        if not np.isfinite(part).all():
+            line = first_line + text.count("\n", 0, start)
+            tokens = Tokens(path, text[start:stop], line)
+            while tokens.peek():
+                tokens.number()
+        parts.append(part)
+        start = stop
+    return np.concatenate(parts)
+
+
 class Tokens:
     """The words of a text in order; each knows its line."""
 

@@ -17,24 +17,22 @@ from dcc_jax.motion.formats.asf_amc import (
     read_amc,
     skeletons_beside,
 )
+from dcc_jax.motion.formats.archive import is_archive, read_archive
 from dcc_jax.motion.formats.bvh import is_bvh, read_bvh
 from dcc_jax.motion.formats.deepmimic import is_deepmimic, read_deepmimic
 from dcc_jax.motion.formats.npz import MotionError
-from dcc_jax.motion.formats.poselib import is_poselib, read_poselib
-from dcc_jax.motion.formats.skeleton import (
-    AXES,
-    UNITS,
-    Motion,
-    in_metres,
-    in_our_axes,
-    rest_on_frame,
-)
+from dcc_jax.motion.formats.skeleton import AXES, UNITS, Motion, rest_on_frame
+from dcc_jax.motion.retarget.anatomy import Anatomy
+from dcc_jax.motion.retarget.axes import refuse_swapped_sides
+from dcc_jax.motion.retarget.lead_in import without_rest_pose
 from dcc_jax.motion.retarget.loops import as_loop
-from dcc_jax.motion.retarget.names import describe, is_plain, match
+from dcc_jax.motion.retarget.match import match
 from dcc_jax.motion.retarget.quality import measure
 from dcc_jax.motion.retarget.retarget import LOW_PASS, Retargeted, placed, retarget
 
-FORMATS = ("amc", "bvh", "deepmimic", "poselib")
+FORMATS = ("amc", "bvh", "deepmimic", "npz")
+SIDES = ("keep", "swap", "mirror")
+LEGS = (0.2, 2.0)  # m, of thigh and shin of any person, by which a given unit is checked
 _HEAD = 4096  # bytes that tell the format
 
 
@@ -48,6 +46,8 @@ class Options:
     unit: str | None = None
     up: str | None = None
     names: Mapping[str, str] | None = None  # node by body
+    root: str | None = None  # which ROOT of a BVH file
+    sides: str = "keep"  # what to do to left and right
     rest_frame: int | None = None  # a frame that stands upright, arms out or down
     trim: tuple[float, float] | None = None  # s
     loop: bool = False
@@ -58,6 +58,7 @@ class Options:
         _check_choice("format", self.format, ("auto", *FORMATS))
         _check_choice("unit", self.unit, (None, *UNITS))
         _check_choice("up", self.up, (None, *AXES))
+        _check_choice("sides", self.sides, SIDES)
         for name in ("fps", "source_fps"):
             rate = getattr(self, name)
             if rate is not None and not 1.0 <= rate <= 1000.0:
@@ -108,7 +109,7 @@ def detect_format(path: Path) -> str:
         raise MotionError(path, "the file is empty")
     head = data.removeprefix(b"\xef\xbb\xbf").decode("latin-1")
     tests = {
-        "poselib": is_poselib(data),
+        "npz": is_archive(data),
         "bvh": is_bvh(head),
         "deepmimic": is_deepmimic(head),
         "amc": is_amc(head),
@@ -142,8 +143,12 @@ def read_motion(path: Path, options: Options, skeletons: Sequence[Path]) -> Moti
         if options.source_fps is None:
             notes.append(f"the file states no frame rate, taken as {DEFAULT_FPS:g} fps")
         return replace(motion, notes=(*notes, *motion.notes))
-    readers = {"bvh": read_bvh, "deepmimic": read_deepmimic, "poselib": read_poselib}
-    motion = readers[kind](path)
+    if kind == "bvh":
+        return read_bvh(path, options.source_fps, options.root)
+    if kind == "npz":
+        motion = read_archive(path, options.source_fps)
+    else:
+        motion = read_deepmimic(path)
     return replace(motion, fps=options.source_fps or motion.fps)
 
 
@@ -171,20 +176,36 @@ def import_motion(
 def _imported(motion: Motion, options: Options) -> Retargeted:
     if options.rest_frame is not None:
         motion = rest_on_frame(motion, options.rest_frame)
+    bodies, notes = match(motion, options.names)
+    motion = without_rest_pose(Anatomy(motion.noted(*notes), bodies))
     if options.trim is not None:
         motion = _trimmed(motion, *options.trim)
-    bodies = match(motion, options.names)
-    if not is_plain(motion, bodies):
-        matched = f"please check the joints: {describe(motion, bodies)}"
-        motion = replace(motion, notes=(*motion.notes, matched))
-    motion = in_our_axes(in_metres(motion, bodies, options.unit), bodies, options.up)
     if options.loop:
         motion = replace(motion, loop=False)
-    result = retarget(motion, bodies, options.fps, options.low_pass, options.clean)
+    figure = Anatomy(motion, bodies)
+    check_unit(figure, options.unit)
+    refuse_swapped_sides(figure)
+    result = retarget(
+        figure, options.fps, options.up, options.low_pass, options.clean
+    )
     if not options.loop:
         return result
     clip = placed(as_loop(result.clip))
     return replace(result, clip=clip, after=measure(clip))
+
+
+def check_unit(figure: Anatomy, unit: str | None) -> None:
+    """Checks a unit that the user gave: the legs tell the scale of a figure.
+
+    Raises:
+        MotionError: nobody has such legs.
+    """
+    if unit is None:
+        return
+    legs = figure.leg_length * UNITS[unit]
+    if not LEGS[0] < legs < LEGS[1]:
+        reason = f"thigh and shin would be {legs:.3g} m long with --unit {unit}"
+        raise MotionError(figure.motion.path, reason)
 
 
 def _trimmed(motion: Motion, start: float, stop: float) -> Motion:

@@ -1,14 +1,13 @@
 """From a foreign skeleton to ours: rotation copy, ground, feet.
 
 Every segment of ours takes the world rotation of its source segment away from the
-source's zero pose, after a constant correction that turns our zero pose (a T-pose with
-vertical legs) into the source's. The root's path is scaled by the ratio of the legs.
+source's zero pose, after the constant rotation of our segment in that zero pose
+(`calibrate`). The root's path is scaled by the ratio of the legs.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,19 +16,22 @@ from scipy.spatial.transform import Rotation
 
 from dcc_jax.motion import clip as clips
 from dcc_jax.motion.clip import Clip
-from dcc_jax.motion.formats.skeleton import Motion, leg_length
 from dcc_jax.motion.frames import moved, to_quats, to_rotation
+from dcc_jax.motion.retarget.anatomy import Anatomy
+from dcc_jax.motion.retarget.axes import standing_axes, world_axes
+from dcc_jax.motion.retarget.calibrate import calibrated
 from dcc_jax.motion.retarget.cleaning import clean_feet
-from dcc_jax.motion.retarget.figure import SEGMENTS, figure, qpos_of, world_of
+from dcc_jax.motion.retarget.figure import SEGMENTS, qpos_of, world_of
+from dcc_jax.motion.retarget.figure import figure as our_figure
 from dcc_jax.motion.retarget.ground import contacts, on_level_ground
 from dcc_jax.motion.retarget.loops import closed, looped, tiled
+from dcc_jax.motion.retarget.positions import denied_by_positions, from_positions
 from dcc_jax.motion.retarget.quality import Quality, measure, pose_error
+from dcc_jax.motion.retarget.travel import root_stays, walked_path
 
 LOW_PASS = 10.0  # Hz, for what was recorded faster than 60 Hz
 WORK_FPS = 60.0  # frame rate for cleaning, where the wanted one divides it
-OWN_DIRECTION = math.radians(10.0)  # a bone off its limb by more is aligned by itself
 WORST_POSE = 8.0  # degrees of mean pose error; standing feet ask for less than 3
-SPREAD = math.radians(12.0)  # legs spread further have feet square to them
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,25 +47,26 @@ class Retargeted:
 
 
 def retarget(
-    motion: Motion,
-    bodies: Mapping[str, int],
+    figure: Anatomy,
     fps: float,
+    up: str | None = None,
     low_pass: float = LOW_PASS,
     clean: bool = True,
 ) -> Retargeted:
-    """A clip of our body from a motion in our axes and in metres.
+    """A clip of our body from a figure in its own axes and unit.
 
     Args:
-        motion: the source.
-        bodies: node of each of our bodies.
+        figure: the source, with our joints found in it.
         fps: frame rate of the clip.
+        up: the world's upward axis in the source, if the caller knows.
         low_pass: Hz; frequencies above are removed from fast recordings; 0 keeps all.
         clean: whether feet are kept from sliding and sinking.
     """
-    root, world = copied(motion, bodies)
+    motion = figure.motion
+    root, world, notes = copied(figure, up)
     name = Path(motion.path).stem
     raw = Clip(qpos_of(root, world), motion.fps, name, Path(motion.path).name)
-    notes = motion.notes
+    notes = (*motion.notes, *notes)
     if motion.loop:
         raw, note = looped(raw)
         notes = (*notes, note) if note else notes
@@ -121,57 +124,35 @@ def placed(clip: Clip) -> Clip:
     return replace(clip, qpos=clips.join_qpos(position, quats))
 
 
-def copied(motion: Motion, bodies: Mapping[str, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Our root's path [T, 3] and world rotations [T, 13, 4] by rotation copy."""
-    body = figure()
-    nodes = [bodies[name] for name in SEGMENTS]
-    away = to_rotation(motion.quats[:, nodes])
-    world = to_quats(away * corrections(motion, bodies))
-    ratio = sum(body.leg) / leg_length(motion, bodies)
-    positions = motion.positions()
-    hips = positions[:, [bodies["left_thigh"], bodies["right_thigh"]]].mean(axis=1)
-    own = body.offsets[[SEGMENTS.index(f"{s}_thigh") for s in ("left", "right")]]
-    return ratio * hips - to_rotation(world[:, 0]).apply(own.mean(axis=0)), world
+def copied(
+    figure: Anatomy, up: str | None = None
+) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Our root's path [T, 3] and world rotations [T, 13, 4], and what was assumed.
 
-
-def corrections(motion: Motion, bodies: Mapping[str, int]) -> Rotation:
-    """Constant rotations [13] from our zero pose to the source's, by segment."""
-    turns = {name: Rotation.identity() for name in SEGMENTS}
-    rest = motion.rest()
-    for side, out in (("left", 1.0), ("right", -1.0)):
-        leg = [rest[bodies[f"{side}_{part}"]] for part in ("thigh", "shin", "foot")]
-        thigh, shin = _limb_turns(np.array([0.0, 0.0, -1.0]), leg)
-        turns[f"{side}_thigh"], turns[f"{side}_shin"] = thigh, shin
-        if thigh.magnitude() > SPREAD:
-            turns[f"{side}_foot"] = shin
-        hand = bodies.get(f"{side}_hand")
-        arm = [rest[bodies[f"{side}_{part}"]] for part in ("upper_arm", "forearm")]
-        arm += [rest[hand]] if hand is not None else []
-        upper, lower = _limb_turns(np.array([0.0, out, 0.0]), arm)
-        turns[f"{side}_upper_arm"], turns[f"{side}_forearm"] = upper, lower
-    return Rotation.concatenate([turns[name] for name in SEGMENTS])
-
-
-def _limb_turns(ours: np.ndarray, joints: list[np.ndarray]) -> list[Rotation]:
-    """Turns of both bones of a limb from our direction to the source's.
-
-    A bone takes the direction of the whole limb, so that a joint centre a little off
-    the line bends nothing, unless its own differs by more than `OWN_DIRECTION`.
+    Args:
+        figure: the source.
+        up: the world's upward axis in it, if the caller knows.
     """
-    whole = _turn(ours, joints[-1] - joints[0])
-    turns = []
-    for begin, end in zip(joints[:2], [*joints[1:], joints[-1]][:2], strict=True):
-        own = _turn(ours, end - begin) if np.linalg.norm(end - begin) > 1e-6 else whole
-        apart = (whole.inv() * own).magnitude()
-        turns.append(own if apart > OWN_DIRECTION else whole)
-    return turns
-
-
-def _turn(ours: np.ndarray, theirs: np.ndarray) -> Rotation:
-    """The shortest rotation from one direction to another."""
-    theirs = theirs / max(float(np.linalg.norm(theirs)), 1e-12)
-    axis = np.cross(ours, theirs)
-    sine = float(np.linalg.norm(axis))
-    if sine < 1e-9:
-        return Rotation.identity()
-    return Rotation.from_rotvec(axis / sine * math.atan2(sine, float(ours @ theirs)))
+    rest_axes = standing_axes(figure.rest)
+    axes, notes = world_axes(figure, rest_axes, up)
+    frames, more = calibrated(figure, rest_axes, axes[2])
+    theirs = {
+        segment: figure.turns[segment] * Rotation.from_matrix(matrix)
+        for segment, matrix in frames.items()
+    }
+    trunk, limbs = denied_by_positions(figure)
+    if trunk or limbs:
+        theirs = from_positions(figure, theirs, rest_axes, trunk, limbs)
+        which = "the trunk" if trunk else ", ".join(limbs)
+        more += (f"rotations and positions disagree in {which}: positions were taken",)
+    turn = Rotation.from_matrix(axes)
+    world = np.stack([to_quats(turn * theirs[name]) for name in SEGMENTS], axis=1)
+    notes = (*notes, *more)
+    if root_stays(figure.middle("thigh"), figure.leg_length):
+        note = "the file says nothing of where the figure goes: its standing foot stays"
+        return walked_path(world), world, (*notes, note)
+    body = our_figure()
+    ratio = sum(body.leg) / figure.leg_length
+    hips = ratio * turn.apply(figure.middle("thigh"))
+    own = body.offsets[[SEGMENTS.index(f"{s}_thigh") for s in ("left", "right")]]
+    return hips - to_rotation(world[:, 0]).apply(own.mean(axis=0)), world, notes

@@ -1,0 +1,179 @@
+"""Which way is up, and which way a figure stands and faces in its zero pose.
+
+Letters: T frames. Vectors are in the axes of the source.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from dcc_jax.motion.formats.npz import MotionError
+from dcc_jax.motion.formats.skeleton import AXES
+from dcc_jax.motion.retarget.anatomy import Anatomy, across, unit
+from dcc_jax.motion.retarget.words import SIDES
+
+SNAP = math.cos(math.radians(3.0))  # a heading this near to an axis is meant to be it
+TILT = math.cos(math.radians(25.0))  # of the legs of a figure that stands
+FLOOR = 0.2  # of a leg: so near to zero is the floor of most recordings
+UPRIGHT = 0.8  # of the trunk along the vertical
+TRAVEL = 1.0  # legs: who goes as far, walks
+MOSTLY = 0.95  # share of the frames
+
+
+def standing_axes(rest: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """Rows forward, left and up of a zero pose; None where it does not stand.
+
+    Arms may be anywhere.
+
+    Args:
+        rest: positions [3] of the joints, by body.
+    """
+
+    def middle(part: str) -> np.ndarray:
+        return 0.5 * (rest[f"left_{part}"] + rest[f"right_{part}"])
+
+    legs = unit(middle("thigh") - middle("foot"))
+    trunk = unit(middle("upper_arm") - middle("thigh"))
+    up = nearest_axis(legs)
+    sides = [rest[f"left_{p}"] - rest[f"right_{p}"] for p in ("thigh", "upper_arm")]
+    level = [across(side, up) for side in sides if np.linalg.norm(side) > 1e-9]
+    each = [unit(rest[f"{s}_thigh"] - rest[f"{s}_foot"]) @ up for s in SIDES]
+    left = unit(np.sum(level, axis=0)) if level else np.zeros(3)
+    stands = legs @ up > TILT and trunk @ up > TILT and min(each) > 0.7
+    if not stands or any(one @ left < TILT for one in level) or not left.any():
+        return None
+    if left @ nearest_axis(left) > SNAP:
+        left = nearest_axis(left)
+    return np.stack([np.cross(left, up), left, up])
+
+
+def world_axes(
+    figure: Anatomy, rest_axes: np.ndarray | None, given: str | None
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Rows of the world's axes, z up, and what to tell the user about them.
+
+    What the caller says comes first, then what the format fixes. Else the world's up is
+    that of the zero pose, however the figure lies: it is another only where the figure
+    plainly stands and goes along that.
+    """
+    notes: tuple[str, ...] = ()
+    named = given or figure.motion.up
+    if named is not None:
+        up = np.eye(3)[AXES.index(named) % 3] * (1.0 if AXES.index(named) < 3 else -1.0)
+    elif rest_axes is not None:
+        up, notes = _unlike_the_zero_pose(figure, rest_axes[2])
+    else:
+        up = max(np.concatenate([np.eye(3), -np.eye(3)]), key=_standing_score(figure))
+        notes = (f"the world's up was taken as {axis_name(up)}: say --up if it is not",)
+    level = np.eye(3)[int(np.argmin(np.abs(up)))]
+    if rest_axes is not None and abs(rest_axes[0] @ up) < 0.9:
+        level = rest_axes[0]
+    ahead = across(level, up)
+    return np.stack([ahead, np.cross(up, ahead), up]), notes
+
+
+def axis_name(up: np.ndarray) -> str:
+    """The name of the axis nearest to a direction."""
+    return AXES[int(np.argmax(np.concatenate([up, -up])))]
+
+
+def nearest_axis(v: np.ndarray) -> np.ndarray:
+    """The unit vector along the axis nearest to a direction."""
+    axis = np.zeros(3)
+    largest = int(np.argmax(np.abs(v)))
+    axis[largest] = math.copysign(1.0, v[largest])
+    return axis
+
+
+def _unlike_the_zero_pose(
+    figure: Anatomy, up: np.ndarray
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """The world's up where the zero pose has another, and a note.
+
+    Some programs keep a zero pose with y up and turn the root until z is up. But who
+    lies on a floor is not to be stood upright.
+    """
+    trunk = unit(figure.middle("upper_arm") - figure.middle("thigh"))
+    if (trunk @ up > 0.5).any():
+        return up, ()
+    other = nearest_axis(trunk.mean(axis=0))
+    if _stands(figure, other) and not (other @ up):
+        name = axis_name(other)
+        return other, (f"the world's up is {name}, unlike the zero pose's",)
+    name = axis_name(up)
+    return up, (f"the figure never stands: up was taken as {name}, the zero pose's",)
+
+
+def _stands(figure: Anatomy, up: np.ndarray) -> bool:
+    """Whether a figure stands all the time along an axis, on a floor or on its way."""
+    trunk, feet = _posture(figure, up)
+    always = np.mean((trunk > UPRIGHT) & (feet > UPRIGHT)) > MOSTLY
+    floor = min(float((figure.places[f"{s}_foot"] @ up).min()) for s in SIDES)
+    floor /= figure.leg_length
+    way = figure.middle("thigh")
+    way = np.ptp(way - np.outer(way @ up, up), axis=0).max() / figure.leg_length
+    return bool(always and (-0.5 * FLOOR < floor < FLOOR or way > TRAVEL))
+
+
+def _posture(figure: Anatomy, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far up the trunk points, and the legs, from feet to hips, [T]."""
+    trunk = unit(figure.middle("upper_arm") - figure.middle("thigh")) @ up
+    return trunk, unit(figure.middle("thigh") - figure.middle("foot")) @ up
+
+
+def _standing_score(figure: Anatomy):
+    """How plausible an axis is as the world's up where the zero pose does not say."""
+
+    def score(up: np.ndarray) -> float:
+        trunk, feet = _posture(figure, up)
+        upright = float(np.mean((trunk > UPRIGHT) & (feet > UPRIGHT)))
+        low = [figure.places[body] @ up for body in figure.places]
+        floor = float(np.percentile(np.min(low, axis=0), 5)) / figure.leg_length
+        on_floor = 1.0 if abs(floor) < FLOOR else 0.0
+        usual = {"y": 0.3, "z": 0.2}.get(axis_name(up), 0.0)
+        return upright + 0.7 * on_floor + usual
+
+    return score
+
+
+def sides_defect(figure: Anatomy) -> str:
+    """Why left and right cannot be as the names say; empty where they can.
+
+    Knees bend backwards and toes point ahead. Ahead follows from left and up: where all
+    knees and toes deny it, the sides are swapped or the axes left-handed.
+    """
+    trunk = unit(figure.middle("upper_arm") - figure.middle("thigh"))
+    left = across(figure.across("thigh"), trunk)
+    ahead = np.cross(left, trunk)
+    knees, toes = 0.0, []
+    for side in SIDES:
+        axis, surely = figure.hinge(f"{side}_thigh")
+        knees += float((surely * (axis * left).sum(axis=1)).mean())
+        toe = unit(figure.bone(f"{side}_foot"))
+        down = unit(figure.bone(f"{side}_shin"))
+        toes.append(float((across(toe, down) * ahead).sum(axis=1).mean()))
+    pointing = [toe for toe in toes if abs(toe) > 0.3]
+    against = bool(pointing) and max(pointing) < 0.0
+    if against and knees < 0.02:
+        return "knees and toes point backwards"
+    if not pointing and knees < -0.05:
+        return "knees bend forwards"
+    return ""
+
+
+def refuse_swapped_sides(figure: Anatomy) -> None:
+    """Refuses a figure whose left is its right.
+
+    Raises:
+        MotionError: it is one.
+    """
+    defect = sides_defect(figure)
+    if defect:
+        raise MotionError(
+            figure.motion.path,
+            f"{defect} if left and right are as named: sides are swapped "
+            "(--sides swap) or the axes are left-handed (--sides mirror)",
+        )
