@@ -38,9 +38,11 @@ ROOT, FOOT = slice(0, 3), (slice(3, 9), slice(9, 15))
 LEVER = 0.2  # m
 SLIP = 20.0  # s, on the speed of a standing point
 HEIGHT = 100.0  # on the height of a standing point, and on what is below the ground
-STRETCH = 1.0  # on a change of the distance from hip to ankle
+KNEE = 0.15  # on a change of a knee's flexion, a radian
+KNEE_EASE = 0.08  # s, over which such changes come and go
+LEAST_SINE = 0.12  # of the flexion: nearer to straight the gain is as at 7 degrees
 TOO_FAR = 100.0  # on what a leg would be longer than it is
-CLEARANCE = 0.012  # m, of a foot that swings at `SWING[1]` m/s; none at SWING[0]
+CLEARANCE = 0.012  # m, that a foot swinging at `SWING[1]` m/s may not lose; 0 at [0]
 SWING = (0.5, 1.5)
 PIVOT = 1.0  # rad/s; a foot that turns faster stands on the slower of heel and toe only
 ROOT_EASE, FOOT_EASE = 0.20, 0.08  # s, over which corrections come and go
@@ -81,11 +83,12 @@ def _settled(body: Figure, start: _Pose, contacts: np.ndarray, fps: float) -> _P
         excess, along = _stretches(body, now)
         floored |= low < least
         taut |= excess > 0.0
-        equations = Equations(width=2 * UNKNOWNS)
+        equations = Equations(width=3 * UNKNOWNS)
         _stay_close(equations, change, fps)
         _hold(equations, low, least, moves, standing | floored)
         _stop(equations, body, now, fixed, moves, fps)
-        _keep_length(equations, start, now, excess, along, taut)
+        _keep_length(equations, len(change), excess, along, taut)
+        _keep_knees(equations, body, start, now, along, fps)
         step = equations.solve(change.size).reshape(change.shape)
         change = change + step
         feet = np.stack([step[:, part] for part in FOOT], axis=1)
@@ -169,11 +172,15 @@ def _heights(body: Figure, pose: _Pose) -> tuple[np.ndarray, np.ndarray]:
 def _least_heights(
     body: Figure, pose: _Pose, standing: np.ndarray, fps: float
 ) -> np.ndarray:
-    """How high the points of the soles have to be, [T, 2, 4]: swinging ones clear."""
+    """How high the points of the soles have to be, [T, 2, 4].
+
+    Swinging ones keep their clearance as far as they have it.
+    """
     centres = body.sole_centres(pose.ankles, pose.feet)
     speed = np.linalg.norm(np.gradient(centres, 1.0 / fps, axis=0), axis=-1)
     swing = np.clip((speed - SWING[0]) / (SWING[1] - SWING[0]), 0.0, 1.0)
-    return np.where(standing, 0.0, CLEARANCE * swing)
+    own = np.maximum(centres[..., 2] - body.radius, 0.0)
+    return np.where(standing, 0.0, np.minimum(CLEARANCE * swing, own))
 
 
 def _stretches(body: Figure, pose: _Pose) -> tuple[np.ndarray, np.ndarray]:
@@ -249,21 +256,65 @@ def _stop(
 
 
 def _keep_length(
+    equations: Equations, frames: int, excess: np.ndarray, along: np.ndarray, taut: np.ndarray
+) -> None:
+    """Legs are never longer than they are."""
+    for side in range(2):
+        on = np.flatnonzero(taut[:, side])
+        columns, values = _leg_columns(np.arange(frames), side, along)
+        wanted = -TOO_FAR * excess[on, side]
+        equations.add(columns[on], TOO_FAR * values[on], wanted)
+
+
+def _leg_columns(
+    frames: np.ndarray, side: int, along: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Unknowns [N, 6] that change the distance from hip to ankle, and by how much."""
+    root = frames[:, None] * UNKNOWNS + np.arange(UNKNOWNS)[ROOT]
+    columns = np.concatenate([root, _foot_columns(frames, side)[:, :3]], axis=1)
+    return columns, np.concatenate([-along[:, side], along[:, side]], axis=1)
+
+
+def _keep_knees(
     equations: Equations,
+    body: Figure,
     start: _Pose,
     pose: _Pose,
-    excess: np.ndarray,
     along: np.ndarray,
-    taut: np.ndarray,
+    fps: float,
 ) -> None:
-    """Legs keep the length from hip to ankle they had, and never exceed their own."""
-    before, now = (np.linalg.norm(p.ankles - p.hips, axis=-1) for p in (start, pose))
+    """Knees bend as they did, and above all as smoothly.
+
+    By the law of cosines the flexion changes by -L / (a b sin) a metre of distance L
+    from hip to ankle, a and b being thigh and shin: near the straight leg a millimetre
+    is a degree, which is how a knee comes to pop.
+    """
+    upper, lower = body.leg
+    before, now = _flexion(body, start), _flexion(body, pose)
+    distance = np.linalg.norm(pose.ankles - pose.hips, axis=-1)
+    gain = -distance / (upper * lower * np.maximum(np.sin(now), LEAST_SINE))
+    change = now - before
     frames = np.arange(len(now))
-    root = frames[:, None] * UNKNOWNS + np.arange(UNKNOWNS)[ROOT]
+    smooth = KNEE * (KNEE_EASE * fps) ** 2
     for side in range(2):
-        columns = np.concatenate([root, _foot_columns(frames, side)[:, :3]], axis=1)
-        values = np.concatenate([-along[:, side], along[:, side]], axis=1)
-        change = STRETCH * (before - now)[:, side]
-        equations.add(columns, STRETCH * values, change)
-        on = taut[:, side]
-        equations.add(columns[on], TOO_FAR * values[on], -TOO_FAR * excess[on, side])
+        columns, values = _leg_columns(frames, side, along)
+        values = values * gain[:, side, None]
+        equations.add(columns, KNEE * values, -KNEE * change[:, side])
+        if len(frames) < 3:
+            continue
+        parts = [(0, 1.0), (1, -2.0), (2, 1.0)]
+        last = len(frames) - 2
+        three = [columns[at : at + last] for at, _ in parts]
+        bends = [smooth * factor * values[at : at + last] for at, factor in parts]
+        bend = np.diff(change[:, side], 2)
+        equations.add(
+            np.concatenate(three, axis=1), np.concatenate(bends, axis=1), -smooth * bend
+        )
+
+
+def _flexion(body: Figure, pose: _Pose) -> np.ndarray:
+    """Flexion [T, 2] of the knees in rad for the distance from hip to ankle."""
+    upper, lower = body.leg
+    distance = np.linalg.norm(pose.ankles - pose.hips, axis=-1)
+    cosine = (distance**2 - upper**2 - lower**2) / (2.0 * upper * lower)
+    return np.arccos(np.clip(cosine, -1.0, 1.0))

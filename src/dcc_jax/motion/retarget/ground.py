@@ -24,7 +24,12 @@ NEXT_PLACE = 0.3  # m, between stances that count as different places
 # A part touches down below the first height and speed, and leaves above the second.
 HEIGHTS = (0.035, 0.05)  # m
 SPEEDS = (0.35, 0.55)  # m/s
+FIRM = 0.1  # m/s, of a part that stands beyond doubt
 SHORTEST = 0.06  # s, of a contact, and of a gap in one
+# At its ends a contact is only where the part is near its place in the middle of it: a
+# heel that rises slowly over standing toes has left the ground.
+RISEN = 0.008  # m
+LEAVING = 0.15  # m/s
 
 
 def on_level_ground(clip: Clip) -> tuple[Clip, float]:
@@ -105,21 +110,51 @@ def contacts(clip: Clip) -> np.ndarray:
     height = parts[..., 2] - figure().radius
     velocity = np.gradient(parts, 1.0 / clip.fps, axis=0)
     speed = np.linalg.norm(velocity, axis=-1)
-    touch = (height < HEIGHTS[0]) & (speed < SPEEDS[0])
+    low = _touching_height(height, speed)
+    touch = (height < low) & (speed < SPEEDS[0])
     stay = (height < HEIGHTS[1]) & (speed < SPEEDS[1])
     shortest = max(1, round(SHORTEST * clip.fps))
     out = np.zeros_like(touch)
     for foot in range(2):
         for part in range(2):
             held = _held(touch[:, foot, part], stay[:, foot, part])
-            out[:, foot, part] = _without_short_runs(held, shortest)
+            held = _without_short_runs(held, shortest)
+            at = height[:, foot, part], speed[:, foot, part]
+            out[:, foot, part] = _without_loose_ends(held, *at)
     return out
+
+
+def _touching_height(height: np.ndarray, speed: np.ndarray) -> float:
+    """Below which height (m) a slow part touches the ground.
+
+    Where all that stands firmly is at zero, a toe that hangs in the air for a moment
+    3 cm above it is not standing; in a recording whose feet are less exact it may be.
+    """
+    firm = height[(speed < FIRM) & (height < HEIGHTS[0])]
+    spread = float(np.percentile(firm, 90)) if firm.size else HEIGHTS[0]
+    return float(np.clip(spread + RISEN, 1.5 * RISEN, HEIGHTS[0]))
 
 
 def _held(touch: np.ndarray, stay: np.ndarray) -> np.ndarray:
     """Stretches of `stay` that hold some `touch`, [T]."""
     labels = np.cumsum(np.diff(stay, prepend=False) & stay) * stay
     return stay & np.isin(labels, np.unique(labels[touch & stay]))
+
+
+def _without_loose_ends(
+    on: np.ndarray, height: np.ndarray, speed: np.ndarray
+) -> np.ndarray:
+    """The contact [T] without the frames at its ends in which the part leaves."""
+    out = on.copy()
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]])))
+    for start, stop in edges.reshape(-1, 2):
+        run = slice(start, stop)
+        place, slow = np.percentile(height[run], 30), np.percentile(speed[run], 30)
+        loose = (height[run] > place + RISEN) | (speed[run] > slow + LEAVING)
+        firm = np.flatnonzero(~loose)
+        out[start : start + firm[0]] = False
+        out[start + firm[-1] + 1 : stop] = False
+    return out
 
 
 def _without_short_runs(on: np.ndarray, shortest: int) -> np.ndarray:

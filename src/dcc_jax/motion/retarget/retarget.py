@@ -148,7 +148,7 @@ def copied(
     turn = Rotation.from_matrix(axes)
     world = np.stack([to_quats(turn * theirs[name]) for name in SEGMENTS], axis=1)
     notes = (*notes, *more)
-    if root_stays(figure.middle("thigh"), figure.leg_length):
+    if root_stays(figure.places["pelvis"], figure.leg_length):
         note = "the file says nothing of where the figure goes: its standing foot stays"
         return walked_path(world), world, (*notes, note)
     body = our_figure()

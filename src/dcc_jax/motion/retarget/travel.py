@@ -15,7 +15,7 @@ STILL = 1e-4  # legs: who moves less, stays where it is
 
 
 def root_stays(root: np.ndarray, leg: float) -> bool:
-    """Whether the hips [T, 3] never move, on legs so long."""
+    """Whether the pelvis [T, 3] never moves, on legs so long."""
     return bool(np.ptp(root, axis=0).max() < STILL * leg)
 
 
