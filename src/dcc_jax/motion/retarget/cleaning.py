@@ -48,24 +48,32 @@ PIVOT = 1.0  # rad/s; a foot that turns faster stands on the slower of heel and 
 ROOT_EASE, FOOT_EASE = 0.20, 0.08  # s, over which corrections come and go
 
 
-def clean_feet(clip: Clip, contacts: np.ndarray) -> Clip:
+def clean_feet(
+    clip: Clip, contacts: np.ndarray, left: np.ndarray | None = None
+) -> Clip:
     """The clip with feet that stand where they are said to.
 
     Args:
         clip: on level ground at z = 0.
         contacts: [T, 2, 2], which part (heel, toe) of which foot stands.
+        left: [T, 2], how far a foot is left alone: 1, it need not stand; 2, it may
+            even be below the ground.
     """
+    left = np.zeros(contacts.shape[:2], int) if left is None else left
+    contacts, free = contacts & (left < 1)[..., None], left > 1
     body = figure()
     world = world_of(clip.qpos)
     root = clip.qpos[:, :3].astype(float)
     positions = body.positions(root, world)
     start = _Pose(root, positions[:, list(THIGHS)], positions[:, list(FEET)], world)
-    now = _settled(body, start, contacts, clip.fps)
+    now = _settled(body, start, contacts, free, clip.fps)
     reached = reach_feet(body, now.root, world, now.ankles, now.feet)
     return replace(clip, qpos=qpos_of(now.root, reached))
 
 
-def _settled(body: Figure, start: _Pose, contacts: np.ndarray, fps: float) -> _Pose:
+def _settled(
+    body: Figure, start: _Pose, contacts: np.ndarray, free: np.ndarray, fps: float
+) -> _Pose:
     """The pose after as many corrections as it takes.
 
     An inequality acts from when it is broken for as long as it pushes, which the last
@@ -81,7 +89,7 @@ def _settled(body: Figure, start: _Pose, contacts: np.ndarray, fps: float) -> _P
         now = start.changed(change)
         low, moves = _heights(body, now)
         excess, along = _stretches(body, now)
-        floored |= low < least
+        floored |= (low < least) & ~free[..., None]
         taut |= excess > 0.0
         equations = Equations(width=3 * UNKNOWNS)
         _stay_close(equations, change, fps)

@@ -112,7 +112,7 @@ def contacts(clip: Clip) -> np.ndarray:
     speed = np.linalg.norm(velocity, axis=-1)
     low = _touching_height(height, speed)
     touch = (height < low) & (speed < SPEEDS[0])
-    stay = (height < HEIGHTS[1]) & (speed < SPEEDS[1])
+    stay = (height < low + HEIGHTS[1] - HEIGHTS[0]) & (speed < SPEEDS[1])
     shortest = max(1, round(SHORTEST * clip.fps))
     out = np.zeros_like(touch)
     for foot in range(2):

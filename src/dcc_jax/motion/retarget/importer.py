@@ -24,7 +24,7 @@ from dcc_jax.motion.formats.npz import MotionError
 from dcc_jax.motion.formats.skeleton import AXES, UNITS, Motion, rest_on_frame
 from dcc_jax.motion.retarget.anatomy import Anatomy
 from dcc_jax.motion.retarget.axes import refuse_swapped_sides
-from dcc_jax.motion.retarget.lead_in import without_rest_pose
+from dcc_jax.motion.retarget.lead_in import without_repeats, without_rest_pose
 from dcc_jax.motion.retarget.loops import as_loop
 from dcc_jax.motion.retarget.match import match
 from dcc_jax.motion.retarget.quality import measure
@@ -176,6 +176,7 @@ def import_motion(
 def _imported(motion: Motion, options: Options) -> Retargeted:
     if options.rest_frame is not None:
         motion = rest_on_frame(motion, options.rest_frame)
+    motion = without_repeats(motion)
     bodies, notes = match(motion, options.names)
     motion = without_rest_pose(Anatomy(motion.noted(*notes), bodies))
     if options.trim is not None:

@@ -1,8 +1,9 @@
-"""A T-pose before the motion: recognized by the jump after it, and left out."""
+"""Frames that are no motion: a T-pose before it, and repeats that only raise the rate."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -40,6 +41,27 @@ def without_rest_pose(figure: Anatomy) -> Motion:
             return motion
         if steps[frame].max() > STILL:
             return motion
+    return motion
+
+
+def without_repeats(motion: Motion) -> Motion:
+    """The motion without frames that only repeat the one before, at its true rate.
+
+    Some programs write 30 frames a second as 60 by writing each twice: speeds are then
+    zero in one frame and doubled in the next.
+    """
+    change = np.abs(np.diff(motion.quats, axis=0)).max(axis=(1, 2))
+    moving = np.flatnonzero(change > 1e-6)
+    for factor in (4, 3, 2):
+        phases = moving % factor
+        if len(moving) < 8 or len(moving) * factor < 0.8 * len(change):
+            continue
+        if len(np.unique(phases)) == 1:
+            first = int(moving[0]) + 1
+            kept = np.arange(first % factor, len(motion.root), factor)
+            note = f"every frame is there {factor} times: taken once"
+            part = replace(motion.part(kept), fps=motion.fps / factor)
+            return part.noted(note)
     return motion
 
 

@@ -20,6 +20,7 @@ from dcc_jax.motion.frames import (
 )
 
 SHORTEST = 0.4  # s, of a period
+BRIEFEST = 0.2  # s, of a period that a file claims
 WORST_SEAM = math.radians(30.0)  # a joint may be off by this before closing
 SPEED_WEIGHT = 0.1  # s, of differences in velocity against those in pose
 
@@ -62,6 +63,8 @@ def looped(clip: Clip) -> tuple[Clip, str]:
     Such claims are often loose: the gap between the ends is spread over the period, and
     where it is too wide the clip stays as it is.
     """
+    if clip.duration < BRIEFEST:
+        return replace(clip, loop=False), f"no loop: it lasts {clip.duration:.3f} s"
     gap = math.degrees(_gap(clip.qpos))
     if gap > math.degrees(WORST_SEAM):
         return replace(

@@ -24,14 +24,18 @@ from dcc_jax.motion.retarget.cleaning import clean_feet
 from dcc_jax.motion.retarget.figure import SEGMENTS, qpos_of, world_of
 from dcc_jax.motion.retarget.figure import figure as our_figure
 from dcc_jax.motion.retarget.ground import contacts, on_level_ground
+from dcc_jax.motion.retarget.judge import judged
 from dcc_jax.motion.retarget.loops import closed, looped, tiled
 from dcc_jax.motion.retarget.positions import denied_by_positions, from_positions
 from dcc_jax.motion.retarget.quality import Quality, measure, pose_error
 from dcc_jax.motion.retarget.travel import root_stays, walked_path
 
 LOW_PASS = 10.0  # Hz, for what was recorded faster than 60 Hz
-WORK_FPS = 60.0  # frame rate for cleaning, where the wanted one divides it
+WORK_FPS = 60.0  # frame rate for cleaning, of sources as fast, where the wanted one divides it
 WORST_POSE = 8.0  # degrees of mean pose error; standing feet ask for less than 3
+ATTEMPTS = 6  # at cleaning, each of which leaves more of the feet alone
+LAP = 0.5  # s, of its neighbours that a loop is cleaned with
+Notes = tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +76,7 @@ def retarget(
         notes = (*notes, note) if note else notes
     if low_pass and raw.fps > WORK_FPS and len(raw.qpos) > 8:
         raw = clips.low_pass(raw, min(low_pass, 0.45 * raw.fps))
-    work = clips.resample(raw, fps * max(1, round(WORK_FPS / fps)))
+    work = clips.resample(raw, fps * max(1, round(min(WORK_FPS, raw.fps) / fps)))
     level, slope = on_level_ground(work)
     if slope:
         notes = (*notes, f"took out a slope of {100.0 * slope:.1f} %")
@@ -82,27 +86,58 @@ def retarget(
 
 def finish(level: Clip, fps: float, clean: bool) -> Retargeted:
     """Cleans a clip on level ground, measures it before and after, and places it."""
-    laps = 1 + math.ceil(0.5 / level.duration) if level.loop else 0
-    wide = tiled(level, laps)
+    wide, middle = _with_laps(level)
     standing = contacts(wide)
-    cleaned = clean_feet(wide, standing) if clean else wide
-    start = laps * (len(level.qpos) - 1)
-    middle = slice(start, start + len(level.qpos))
+    cleaned, notes = cleaned_where_better(wide, standing) if clean else (wide, ())
     result = replace(level, qpos=cleaned.qpos[middle])
     if level.loop:
         result = replace(result, qpos=closed(result.qpos))
     error = pose_error(result, world_of(level.qpos))
-    notes: tuple[str, ...] = ()
-    if error > WORST_POSE:
-        notes = (
-            f"feet left as they are: cleaning would turn limbs by {error:.0f} deg",
-        )
-        result, error = level, 0.0
     stances = _thinned(standing[middle], level, fps)
     before = measure(clips.resample(level, fps), stances)
     result = clips.resample(result, fps)
     after = measure(result, stances)
     return Retargeted(placed(result), before, after, error, 0.0, notes)
+
+
+def _with_laps(level: Clip) -> tuple[Clip, slice]:
+    """A loop with some of its neighbours on both sides, and where it is in that."""
+    if not level.loop:
+        return level, slice(0, len(level.qpos))
+    laps = math.ceil(LAP / level.duration)
+    start = laps * (len(level.qpos) - 1)
+    return tiled(level, laps), slice(start, start + len(level.qpos))
+
+
+def cleaned_where_better(clip: Clip, standing: np.ndarray) -> tuple[Clip, Notes]:
+    """The clip with clean feet, except where that makes another thing worse.
+
+    Args:
+        clip: on level ground.
+        standing: contacts [T, 2, 2].
+
+    Returns:
+        The clip, and a note about the feet that were left as they are.
+    """
+    left = np.zeros(standing.shape[:2], int)
+    told: list[str] = []
+    for _ in range(ATTEMPTS):
+        cleaned = clean_feet(clip, standing, left)
+        verdict = judged(clip, cleaned)
+        if verdict.fine:
+            break
+        left = np.minimum(left + verdict.around(), 2)
+        told.append(verdict.reasons())
+    else:
+        return clip, (f"feet left as they are: cleaning {told[-1]}",)
+    if pose_error(cleaned, world_of(clip.qpos)) > WORST_POSE:
+        return clip, ("feet left as they are: cleaning makes another pose of it",)
+    if not told:
+        return cleaned, ()
+    share = 100.0 * (left > 0).any(axis=1).mean()
+    return cleaned, (
+        f"feet left as they are in {share:.0f} % of the frames: cleaning {told[0]}",
+    )
 
 
 def _thinned(standing: np.ndarray, clip: Clip, fps: float) -> np.ndarray:
