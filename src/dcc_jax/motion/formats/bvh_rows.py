@@ -16,6 +16,9 @@ _HEAD = re.compile(
 )
 
 
+NEARLY = 0.75  # of a row: so much of the last one is worth completing
+
+
 @dataclass(frozen=True, eq=False)
 class Rows:
     """The numbers [T, channels] of a MOTION section."""
@@ -31,7 +34,8 @@ def read_rows(
     """The rows of a MOTION section.
 
     A row more or less than claimed is common, and so is a file cut within its last
-    row: what is whole is taken, with a note.
+    row: what is there is taken, with a note. A last row that is nearly whole is
+    completed from the row before.
 
     Args:
         path: of the file.
@@ -58,12 +62,13 @@ def read_rows(
     count = int(claimed)
     if len(values) == count * channels:
         return Rows(values.reshape(count, channels), fps, ())
-    whole = _whole_rows(path, body, line, channels, len(values))
-    if not count <= 2 * whole <= 4 * count:
-        reason = f"claims {head[1][:40]} frames of {channels} numbers, holds {whole}"
-        raise MotionError(path, reason, line)
-    note = f"claims {count} frames, holds {whole}: those were taken"
-    return Rows(values[: whole * channels].reshape(whole, channels), fps, (note,))
+    values, notes = _uneven(path, body, line, channels, values)
+    if not count <= 2 * len(values) <= 4 * count:
+        reason = f"claims {head[1][:40]} frames of {channels} numbers, holds "
+        raise MotionError(path, reason + str(len(values)), line)
+    if count != len(values):
+        notes += (f"claims {count} frames, holds {len(values)}: those were taken",)
+    return Rows(values, fps, notes)
 
 
 def _rate(path: str | Path, token: str, line: int) -> float:
@@ -74,10 +79,10 @@ def _rate(path: str | Path, token: str, line: int) -> float:
     return rate_of(token, seconds)
 
 
-def _whole_rows(
-    path: str | Path, text: str, line: int, channels: int, numbers: int
-) -> int:
-    """How many rows are whole, where not as many numbers are there as claimed.
+def _uneven(
+    path: str | Path, text: str, line: int, channels: int, values: np.ndarray
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Rows [T, channels] where not as many numbers are there as claimed, and notes.
 
     A number that is lost in the middle would shift all that follow: every line but the
     last must be a row.
@@ -87,10 +92,17 @@ def _whole_rows(
     """
     rows = [(at, len(row.split())) for at, row in enumerate(text.split("\n"), line)]
     rows = [(at, size) for at, size in rows if size]
-    for at, size in rows[:-1]:
-        if size != channels:
+    for at, size in rows:
+        if size > channels or (size < channels and at != rows[-1][0]):
             raise MotionError(path, f"a row of {size} numbers, not {channels}", at)
-    if rows and rows[-1][1] > channels:
-        at, size = rows[-1]
-        raise MotionError(path, f"a row of {size} numbers, not {channels}", at)
-    return numbers // channels
+    whole, rest = divmod(len(values), channels)
+    table = values[: whole * channels].reshape(whole, channels)
+    if not rest:
+        return table, ()
+    # A number that the text ends in may have lost its digits.
+    rest -= not text[-1].isspace()
+    if whole and rest >= NEARLY * channels:
+        last = np.concatenate([values[whole * channels :][:rest], table[-1, rest:]])
+        note = f"the last row is cut: {channels - rest} numbers are of the one before"
+        return np.concatenate([table, last[None]]), (note,)
+    return table, ("the last row is cut: left out",)
