@@ -52,14 +52,17 @@ def _prepare(options: Options) -> command.Work:
 
 def _inspect(clip: Clip, options: Options) -> int:
     from dcc_jax.motion.retarget.quality import measure
+    from dcc_jax.motion.retarget.verdict import doubts, verdict
 
+    quality = measure(clip)
+    print(verdict(doubts(clip, quality)))
     loop = ", a loop" if clip.loop else ""
     print(
         f"{clip.name}: {len(clip.qpos)} frames at {clip.fps:g} fps "
         f"({clip.duration:.2f} s{loop}), label {clip.label or '-'}"
     )
     print(f"  source: {clip.source or '-'}; licence: {clip.licence or '-'}")
-    for line in measure(clip).lines():
+    for line in quality.lines():
         print(f"  {line}")
     return _draw(clip, options) if options.plot or options.video else 0
 

@@ -10,7 +10,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from dcc_jax.motion.formats.npz import MotionError
 from dcc_jax.motion.formats.skeleton import AXES
 from dcc_jax.motion.retarget.anatomy import Anatomy, across, unit
 from dcc_jax.motion.retarget.words import SIDES
@@ -137,43 +136,3 @@ def _standing_score(figure: Anatomy):
         return upright + 0.7 * on_floor + usual
 
     return score
-
-
-def sides_defect(figure: Anatomy) -> str:
-    """Why left and right cannot be as the names say; empty where they can.
-
-    Knees bend backwards and toes point ahead. Ahead follows from left and up: where all
-    knees and toes deny it, the sides are swapped or the axes left-handed.
-    """
-    trunk = unit(figure.middle("upper_arm") - figure.middle("thigh"))
-    left = across(figure.across("thigh"), trunk)
-    ahead = np.cross(left, trunk)
-    knees, toes = 0.0, []
-    for side in SIDES:
-        axis, surely = figure.hinge(f"{side}_thigh")
-        knees += float((surely * (axis * left).sum(axis=1)).mean())
-        toe = unit(figure.bone(f"{side}_foot"))
-        down = unit(figure.bone(f"{side}_shin"))
-        toes.append(float((across(toe, down) * ahead).sum(axis=1).mean()))
-    pointing = [toe for toe in toes if abs(toe) > 0.3]
-    against = bool(pointing) and max(pointing) < 0.0
-    if against and knees < 0.02:
-        return "knees and toes point backwards"
-    if not pointing and knees < -0.05:
-        return "knees bend forwards"
-    return ""
-
-
-def refuse_swapped_sides(figure: Anatomy) -> None:
-    """Refuses a figure whose left is its right.
-
-    Raises:
-        MotionError: it is one.
-    """
-    defect = sides_defect(figure)
-    if defect:
-        raise MotionError(
-            figure.motion.path,
-            f"{defect} if left and right are as named: sides are swapped "
-            "(--sides swap) or the axes are left-handed (--sides mirror)",
-        )

@@ -47,6 +47,8 @@ def _is_skeleton(path: Path) -> bool:
 def _targets(motions: list[Path], out: Path, named: bool) -> list[Path]:
     if len(motions) == 1 and out.suffix == ".npz" and not out.is_dir():
         return [out]
+    if out.suffix and out.suffix != ".npz" and not out.is_dir():
+        raise MotionError(out, "a clip ends in .npz; `motion export` writes BVH")
     if out.suffix == ".npz":
         raise MotionError(out, f"must be a directory for {len(motions)} motions")
     if named:

@@ -19,6 +19,8 @@ from dcc_jax.motion.retarget.batch import Batch, make_batch
 from dcc_jax.motion.retarget.importer import FORMATS, import_motion
 from dcc_jax.motion.retarget.names import read_map
 from dcc_jax.motion.retarget.retarget import LOW_PASS, Retargeted
+from dcc_jax.motion.retarget.sides import SIDES
+from dcc_jax.motion.retarget.verdict import verdict
 
 PROGRAM = "dcc_jax.motion.import"
 _AS_FILE = "(default: what the file says)"
@@ -53,9 +55,10 @@ class Options:
     """Frame rate of the source."""
 
     unit: Annotated[
-        str | None, arg(metavar="|".join(UNITS), help_behavior_hint=_AS_FILE)
+        str | None,
+        arg(metavar="|".join(UNITS), help_behavior_hint="(default: the legs tell it)"),
     ] = None
-    """Unit of lengths."""
+    """Unit of lengths; refuses a figure that would be a giant or a dwarf."""
 
     up: Annotated[
         str | None,
@@ -67,6 +70,14 @@ class Options:
         Path | None, arg(metavar="FILE", help_behavior_hint="(default: found out)")
     ] = None
     """Lines 'body = joint' for odd names."""
+
+    root: Annotated[
+        str | None, arg(metavar="NAME", help_behavior_hint="(default: the figure)")
+    ] = None
+    """The ROOT of a BVH file with several figures."""
+
+    sides: Annotated[str, arg(metavar="|".join(SIDES))] = "keep"
+    """Swaps left and right, or mirrors left-handed axes."""
 
     rest_frame: Annotated[
         int | None, arg(metavar="N", help_behavior_hint="(default: the zero pose)")
@@ -124,6 +135,8 @@ def _prepare(options: Options) -> command.Work:
         unit=options.unit,
         up=options.up,
         names=read_map(options.map) if options.map else None,
+        root=options.root,
+        sides=options.sides,
         rest_frame=options.rest_frame,
         trim=None if options.trim is None else importer.read_span(options.trim),
         loop=options.loop,
@@ -184,3 +197,4 @@ def _report(path: Path, target: Path, result: Retargeted) -> None:
     print(f"  mean pose error against the source {result.pose_error:.2f} degrees")
     for before, after in zip(result.before.lines(), result.after.lines(), strict=True):
         print(f"  copied:  {before}\n  cleaned: {after}")
+    print(f"  {verdict(result.doubts)}")

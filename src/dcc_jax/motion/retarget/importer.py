@@ -23,15 +23,15 @@ from dcc_jax.motion.formats.deepmimic import is_deepmimic, read_deepmimic
 from dcc_jax.motion.formats.npz import MotionError
 from dcc_jax.motion.formats.skeleton import AXES, UNITS, Motion, rest_on_frame
 from dcc_jax.motion.retarget.anatomy import Anatomy
-from dcc_jax.motion.retarget.axes import refuse_swapped_sides
 from dcc_jax.motion.retarget.lead_in import without_repeats, without_rest_pose
 from dcc_jax.motion.retarget.loops import as_loop
 from dcc_jax.motion.retarget.match import match
 from dcc_jax.motion.retarget.quality import measure
 from dcc_jax.motion.retarget.retarget import LOW_PASS, Retargeted, placed, retarget
+from dcc_jax.motion.retarget.sides import SIDES, refuse_swapped_sides, with_sides
+from dcc_jax.motion.retarget.verdict import doubts
 
 FORMATS = ("amc", "bvh", "deepmimic", "npz")
-SIDES = ("keep", "swap", "mirror")
 LEGS = (0.2, 2.0)  # m, of thigh and shin of any person, by which a given unit is checked
 _HEAD = 4096  # bytes that tell the format
 
@@ -183,16 +183,31 @@ def _imported(motion: Motion, options: Options) -> Retargeted:
         motion = _trimmed(motion, *options.trim)
     if options.loop:
         motion = replace(motion, loop=False)
-    figure = Anatomy(motion, bodies)
+    figure = with_sides(Anatomy(motion, bodies), options.sides)
     check_unit(figure, options.unit)
     refuse_swapped_sides(figure)
     result = retarget(
         figure, options.fps, options.up, options.low_pass, options.clean
     )
-    if not options.loop:
-        return result
-    clip = placed(as_loop(result.clip))
-    return replace(result, clip=clip, after=measure(clip))
+    if options.loop:
+        clip = placed(as_loop(result.clip))
+        result = replace(result, clip=clip, after=measure(clip))
+    found = (*_guesses(result.notes), *result.doubts)
+    return replace(result, doubts=(*found, *doubts(result.clip, result.after)))
+
+
+def _guesses(notes: Sequence[str]) -> tuple[str, ...]:
+    """What of the notes is more than information."""
+    guesses = {
+        "please check the joints": "joints were told by their place",
+        "the world's up was taken": "up was guessed",
+        "the file says nothing of where": "the way was made from the feet",
+    }
+    return tuple(
+        guess
+        for begin, guess in guesses.items()
+        if any(note.startswith(begin) for note in notes)
+    )
 
 
 def check_unit(figure: Anatomy, unit: str | None) -> None:

@@ -21,7 +21,7 @@ from dcc_jax.motion.frames import split_qpos, to_rotation
 from dcc_jax.motion.retarget.figure import figure, soles_of
 
 CHANGE = np.radians([25.0, 25.0, 40.0])  # of hip, knee and ankle against the copy
-RANGE = math.radians(8.0)  # further out of a joint's range
+RANGE = math.radians(10.0)  # further out of a joint's range
 SPEED = math.radians(300.0)  # rad/s, faster than before
 BEND = 1.2  # times the largest second difference of that knee before
 BEND_SLACK = math.radians(0.5)  # which is no pop

@@ -20,6 +20,8 @@ from dcc_jax.motion.frames import (
 )
 
 SHORTEST = 0.4  # s, of a period
+COMPARED = 1500  # frames that are all compared with each other
+CANDIDATES = 20  # of those cuts that are looked at closely
 BRIEFEST = 0.2  # s, of a period that a file claims
 WORST_SEAM = math.radians(30.0)  # a joint may be off by this before closing
 SPEED_WEIGHT = 0.1  # s, of differences in velocity against those in pose
@@ -90,20 +92,44 @@ def as_loop(clip: Clip) -> Clip:
     Raises:
         ValueError: no stretch comes back to where it began.
     """
-    features = _features(clip)
-    squares = (features**2).sum(axis=1)
-    apart = squares[:, None] + squares - 2.0 * features @ features.T
-    first, last = np.triu_indices(len(features), math.ceil(SHORTEST * clip.fps))
-    if not len(first):
+    shortest = math.ceil(SHORTEST * clip.fps)
+    if len(clip.qpos) <= shortest:
         raise ValueError(f"a loop takes {SHORTEST} s, this lasts {clip.duration:.2f} s")
-    best = int(apart[first, last].argmin())
-    part = crop(clip, first[best] / clip.fps, last[best] / clip.fps)
+    first, last = _best_cut(_features(clip), shortest)
+    part = crop(clip, first / clip.fps, last / clip.fps)
     gap = _gap(part.qpos)
     if gap > WORST_SEAM:
         raise ValueError(
             f"no loop in it: the best seam is off by {math.degrees(gap):.0f} degrees"
         )
     return replace(part, qpos=closed(part.qpos), loop=True)
+
+
+def _best_cut(features: np.ndarray, shortest: int) -> tuple[int, int]:
+    """The two frames of [T, F] features that are most alike, some frames apart.
+
+    Of a long clip every n-th frame is compared with all others first, then the frames
+    about the best of these: time and memory grow with the clip's length alone.
+    """
+    stride = max(1, math.ceil(len(features) / COMPARED))
+    coarse = features[::stride]
+    squares = (coarse**2).sum(axis=1)
+    apart = squares[:, None] + squares - 2.0 * coarse @ coarse.T
+    far = np.arange(len(coarse))
+    gap = max(1, math.ceil(shortest / stride))
+    apart[far[None] - far[:, None] < gap] = np.inf
+    count = min(CANDIDATES, apart.size - 1)
+    best = np.argpartition(apart, count, axis=None)[:count]
+    found = (np.inf, 0, shortest)
+    for one, two in zip(*np.unravel_index(best, apart.shape), strict=True):
+        starts = np.arange(max(0, (one - 1) * stride), (one + 1) * stride + 1)
+        stops = np.arange(max(0, (two - 1) * stride), (two + 1) * stride + 1)
+        starts, stops = (at[at < len(features)] for at in (starts, stops))
+        near = ((features[starts, None] - features[None, stops]) ** 2).sum(-1)
+        near[stops[None] - starts[:, None] < shortest] = np.inf
+        at = np.unravel_index(near.argmin(), near.shape)
+        found = min(found, (near[at], int(starts[at[0]]), int(stops[at[1]])))
+    return found[1], found[2]
 
 
 def _features(clip: Clip) -> np.ndarray:

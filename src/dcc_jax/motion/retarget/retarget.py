@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 from dcc_jax.motion import clip as clips
 from dcc_jax.motion.clip import Clip
 from dcc_jax.motion.frames import moved, to_quats, to_rotation
-from dcc_jax.motion.retarget.anatomy import Anatomy
+from dcc_jax.motion.retarget.anatomy import HINGED, Anatomy, unit
 from dcc_jax.motion.retarget.axes import standing_axes, world_axes
-from dcc_jax.motion.retarget.calibrate import calibrated
+from dcc_jax.motion.retarget.calibrate import along, calibrated
 from dcc_jax.motion.retarget.cleaning import clean_feet
 from dcc_jax.motion.retarget.figure import SEGMENTS, qpos_of, world_of
 from dcc_jax.motion.retarget.figure import figure as our_figure
@@ -29,12 +29,14 @@ from dcc_jax.motion.retarget.loops import closed, looped, tiled
 from dcc_jax.motion.retarget.positions import denied_by_positions, from_positions
 from dcc_jax.motion.retarget.quality import Quality, measure, pose_error
 from dcc_jax.motion.retarget.travel import root_stays, walked_path
+from dcc_jax.motion.retarget.words import SIDES
 
 LOW_PASS = 10.0  # Hz, for what was recorded faster than 60 Hz
 WORK_FPS = 60.0  # frame rate for cleaning, of sources as fast, where the wanted one divides it
 WORST_POSE = 8.0  # degrees of mean pose error; standing feet ask for less than 3
 ATTEMPTS = 6  # at cleaning, each of which leaves more of the feet alone
 LAP = 0.5  # s, of its neighbours that a loop is cleaned with
+BONE_OFF = 8.0  # degrees, in the mean, that a bone may point away from its joints
 Notes = tuple[str, ...]
 
 
@@ -47,7 +49,8 @@ class Retargeted:
     after: Quality
     pose_error: float  # degrees, mean over segments and frames, against the source
     slope: float  # rise over run of the floor that was taken out
-    notes: tuple[str, ...]  # what was assumed, for the user
+    notes: Notes  # what was assumed, for the user
+    doubts: Notes = ()  # what is not plausible in it
 
 
 def retarget(
@@ -81,7 +84,12 @@ def retarget(
     if slope:
         notes = (*notes, f"took out a slope of {100.0 * slope:.1f} %")
     result = finish(level, fps, clean)
-    return replace(result, slope=slope, notes=(*notes, *result.notes))
+    return replace(
+        result,
+        slope=slope,
+        notes=(*notes, *result.notes),
+        doubts=bones_off(figure, world),
+    )
 
 
 def finish(level: Clip, fps: float, clean: bool) -> Retargeted:
@@ -157,6 +165,32 @@ def placed(clip: Clip) -> Clip:
     turned[:, :2] -= turned[0, :2]
     position, quats = clips.split_qpos(turned)
     return replace(clip, qpos=clips.join_qpos(position, quats))
+
+
+def bones_off(figure: Anatomy, world: np.ndarray) -> Notes:
+    """Limbs that do not point where the joints of the source are.
+
+    Args:
+        figure: the source.
+        world: our world rotations [T, 13, 4].
+    """
+    limbs = [f"{side}_{part}" for side in SIDES for part in HINGED]
+    theirs = np.stack([unit(figure.bone(limb)) for limb in limbs], axis=1)
+    ours = np.stack(
+        [to_rotation(world[:, SEGMENTS.index(s)]).apply(along(s)) for s in limbs], axis=1
+    )
+    frames = slice(None, None, max(1, len(ours) // 500))
+    turn, _ = Rotation.align_vectors(
+        ours[frames].reshape(-1, 3), theirs[frames].reshape(-1, 3)
+    )
+    turned = turn.apply(theirs.reshape(-1, 3)).reshape(theirs.shape)
+    cosine = np.clip((turned * ours).sum(-1), -1.0, 1.0)
+    off = np.where(theirs.any(axis=-1), np.degrees(np.arccos(cosine)), 0.0).mean(axis=0)
+    return tuple(
+        f"{limb} points {angle:.0f} degrees off its joints"
+        for limb, angle in zip(limbs, off, strict=True)
+        if angle > BONE_OFF
+    )
 
 
 def copied(

@@ -22,7 +22,7 @@ TURN = 2000.0  # degrees/s, of a joint
 SPEED = 12.0  # m/s, of the root
 BACKWARDS = 15.0  # degrees a knee may bend forwards
 TREADING = 0.5  # m/s: feet that pass under a body which stays
-KNEES = (6, 9)  # their joints, after the root
+KNEES = (7, 10)  # of the joints
 
 
 def doubts(clip: Clip, quality: Quality) -> tuple[str, ...]:
