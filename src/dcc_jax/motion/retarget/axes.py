@@ -62,6 +62,8 @@ def world_axes(
     named = given or figure.motion.up
     if named is not None:
         up = np.eye(3)[AXES.index(named) % 3] * (1.0 if AXES.index(named) < 3 else -1.0)
+        if given and rest_axes is not None and up @ rest_axes[2] < 0.9:
+            notes = (f"the world's up is {given}, unlike the zero pose's",)
     elif rest_axes is not None:
         up, notes = _unlike_the_zero_pose(figure, rest_axes[2])
     else:
@@ -99,22 +101,33 @@ def _unlike_the_zero_pose(
     if (trunk @ up > 0.5).any():
         return up, ()
     other = nearest_axis(trunk.mean(axis=0))
-    if _stands(figure, other) and not (other @ up):
+    if not other @ up and _stands(figure, other, up):
         name = axis_name(other)
         return other, (f"the world's up is {name}, unlike the zero pose's",)
     name = axis_name(up)
     return up, (f"the figure never stands: up was taken as {name}, the zero pose's",)
 
 
-def _stands(figure: Anatomy, up: np.ndarray) -> bool:
-    """Whether a figure stands all the time along an axis, on a floor or on its way."""
+def _stands(figure: Anatomy, up: np.ndarray, zero_up: np.ndarray) -> bool:
+    """Whether a figure stands all the time along an axis, and on a floor.
+
+    Who lies stands along his own trunk, too. So the floor has to be where it usually
+    is, and the other axis has to have the figure in the ground or in the air; or the
+    figure goes somewhere.
+    """
     trunk, feet = _posture(figure, up)
-    always = np.mean((trunk > UPRIGHT) & (feet > UPRIGHT)) > MOSTLY
-    floor = min(float((figure.places[f"{s}_foot"] @ up).min()) for s in SIDES)
-    floor /= figure.leg_length
+    if np.mean((trunk > UPRIGHT) & (feet > UPRIGHT)) <= MOSTLY:
+        return False
     way = figure.middle("thigh")
     way = np.ptp(way - np.outer(way @ up, up), axis=0).max() / figure.leg_length
-    return bool(always and (-0.5 * FLOOR < floor < FLOOR or way > TRAVEL))
+    lies = -0.05 < _lowest(figure, zero_up) < 0.5
+    return bool(way > TRAVEL or (abs(_lowest(figure, up)) < FLOOR and not lies))
+
+
+def _lowest(figure: Anatomy, up: np.ndarray) -> float:
+    """How high above zero the lowest joints are along an axis, in legs."""
+    low = np.min([place @ up for place in figure.places.values()], axis=0)
+    return float(np.percentile(low, 5)) / figure.leg_length
 
 
 def _posture(figure: Anatomy, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -129,9 +142,7 @@ def _standing_score(figure: Anatomy):
     def score(up: np.ndarray) -> float:
         trunk, feet = _posture(figure, up)
         upright = float(np.mean((trunk > UPRIGHT) & (feet > UPRIGHT)))
-        low = [figure.places[body] @ up for body in figure.places]
-        floor = float(np.percentile(np.min(low, axis=0), 5)) / figure.leg_length
-        on_floor = 1.0 if abs(floor) < FLOOR else 0.0
+        on_floor = 1.0 if abs(_lowest(figure, up)) < FLOOR else 0.0
         usual = {"y": 0.3, "z": 0.2}.get(axis_name(up), 0.0)
         return upright + 0.7 * on_floor + usual
 

@@ -14,9 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from dcc_jax.motion.clip import Clip
 from dcc_jax.motion.frames import join_qpos, split_qpos, to_quats, to_rotation
-from dcc_jax.motion.retarget.figure import figure, soles_of
+from dcc_jax.motion.retarget.figure import figure, soles_of, world_of
 
 SLOW = 0.3  # m/s, of a point that may be standing
+TRUNK_RADIUS = 0.1  # m
+UPRIGHT = 0.4  # m, of the pelvis above the feet of who stands, at least once
 MAX_SLOPE = 0.05
 MIN_SLOPE = 0.006  # below this a floor counts as level
 MIN_TRAVEL = 1.0  # m, over which a slope can be told
@@ -29,7 +31,7 @@ SHORTEST = 0.06  # s, of a contact, and of a gap in one
 # At its ends a contact is only where the part is near its place in the middle of it: a
 # heel that rises slowly over standing toes has left the ground.
 RISEN = 0.008  # m
-LEAVING = 0.15  # m/s
+LEAVING = 0.2  # m/s
 
 
 def on_level_ground(clip: Clip) -> tuple[Clip, float]:
@@ -44,10 +46,25 @@ def on_level_ground(clip: Clip) -> tuple[Clip, float]:
         axis = np.array([-direction[1], direction[0], 0.0]) * math.atan(slope)
         clip = _turned(clip, Rotation.from_rotvec(axis))
         stances = _stances(clip)
-    heights = stances[:, 2]
     position, quats = split_qpos(clip.qpos)
-    level = position - [0.0, 0.0, float(np.median(heights))]
+    floor = float(np.median(stances[:, 2]))
+    if floor > float(position[:, 2].max()) - UPRIGHT:
+        floor = min(floor, _lying_floor(clip))
+    level = position - [0.0, 0.0, floor]
     return replace(clip, qpos=join_qpos(level, quats)), slope
+
+
+def _lying_floor(clip: Clip) -> float:
+    """Height (m) of what a figure lies on that does not rest on its feet; inf else.
+
+    It lies where the surface of its trunk is lower than its feet in most frames.
+    """
+    body, world = figure(), world_of(clip.qpos)
+    positions = body.positions(clip.qpos[:, :3].astype(float), world)[..., 2]
+    feet = soles_of(clip.qpos)[..., 2].min(axis=(1, 2)) - body.radius
+    trunk = positions[:, :2].min(axis=1) - TRUNK_RADIUS
+    lying = trunk < feet
+    return float(np.median(trunk[lying])) if lying.mean() > 0.5 else math.inf
 
 
 def _turned(clip: Clip, turn: Rotation) -> Clip:

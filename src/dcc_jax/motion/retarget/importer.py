@@ -179,15 +179,14 @@ def _imported(motion: Motion, options: Options) -> Retargeted:
     motion = without_repeats(motion)
     bodies, notes = match(motion, options.names)
     motion = without_rest_pose(Anatomy(motion.noted(*notes), bodies))
-    if options.trim is not None:
-        motion = _trimmed(motion, *options.trim)
+    part = _part(motion, *options.trim) if options.trim else slice(None)
     if options.loop:
         motion = replace(motion, loop=False)
     figure = with_sides(Anatomy(motion, bodies), options.sides)
     check_unit(figure, options.unit)
     refuse_swapped_sides(figure)
     result = retarget(
-        figure, options.fps, options.up, options.low_pass, options.clean
+        figure, options.fps, options.up, options.low_pass, options.clean, part
     )
     if options.loop:
         clip = placed(as_loop(result.clip))
@@ -224,8 +223,8 @@ def check_unit(figure: Anatomy, unit: str | None) -> None:
         raise MotionError(figure.motion.path, reason)
 
 
-def _trimmed(motion: Motion, start: float, stop: float) -> Motion:
-    """The motion between two times, s.
+def _part(motion: Motion, start: float, stop: float) -> slice:
+    """The frames of a motion between two times, s.
 
     Raises:
         MotionError: less than 2 frames lie between them.
@@ -236,7 +235,4 @@ def _trimmed(motion: Motion, start: float, stop: float) -> Motion:
         raise MotionError(
             motion.path, f"nothing between {start:g} and {stop:g} s of {last:.2f} s"
         )
-    part = slice(round(start * motion.fps), round(stop * motion.fps) + 1)
-    if part == slice(0, len(motion.root)):
-        return motion
-    return replace(motion.part(part), loop=False)
+    return slice(round(start * motion.fps), round(stop * motion.fps) + 1)

@@ -59,8 +59,11 @@ def retarget(
     up: str | None = None,
     low_pass: float = LOW_PASS,
     clean: bool = True,
+    part: slice = slice(None),
 ) -> Retargeted:
     """A clip of our body from a figure in its own axes and unit.
+
+    How the figure's bones lie and where its up is, all frames tell, whichever are taken.
 
     Args:
         figure: the source, with our joints found in it.
@@ -68,13 +71,14 @@ def retarget(
         up: the world's upward axis in the source, if the caller knows.
         low_pass: Hz; frequencies above are removed from fast recordings; 0 keeps all.
         clean: whether feet are kept from sliding and sinking.
+        part: the frames to take.
     """
     motion = figure.motion
     root, world, notes = copied(figure, up)
-    name = Path(motion.path).stem
-    raw = Clip(qpos_of(root, world), motion.fps, name, Path(motion.path).name)
+    qpos = qpos_of(root[part], world[part])
+    raw = Clip(qpos, motion.fps, Path(motion.path).stem, Path(motion.path).name)
     notes = (*motion.notes, *notes)
-    if motion.loop:
+    if motion.loop and len(qpos) == len(root):
         raw, note = looped(raw)
         notes = (*notes, note) if note else notes
     if low_pass and raw.fps > WORK_FPS and len(raw.qpos) > 8:
