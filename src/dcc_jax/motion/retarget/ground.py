@@ -31,7 +31,9 @@ SHORTEST = 0.06  # s, of a contact, and of a gap in one
 # At its ends a contact is only where the part is near its place in the middle of it: a
 # heel that rises slowly over standing toes has left the ground.
 RISEN = 0.008  # m
-LEAVING = 0.2  # m/s
+LEAVING = 0.16  # m/s ...
+HURRY = 0.03  # ... and so much more for every m/s of the body above a walk's
+WALK = 1.5  # m/s
 
 
 def on_level_ground(clip: Clip) -> tuple[Clip, float]:
@@ -131,13 +133,15 @@ def contacts(clip: Clip) -> np.ndarray:
     touch = (height < low) & (speed < SPEEDS[0])
     stay = (height < low + HEIGHTS[1] - HEIGHTS[0]) & (speed < SPEEDS[1])
     shortest = max(1, round(SHORTEST * clip.fps))
+    way = np.linalg.norm(np.diff(clip.qpos[:, :2].astype(float), axis=0), axis=1)
+    leaving = LEAVING + HURRY * max(0.0, float(way.mean()) * clip.fps - WALK)
     out = np.zeros_like(touch)
     for foot in range(2):
         for part in range(2):
             held = _held(touch[:, foot, part], stay[:, foot, part])
             held = _without_short_runs(held, shortest)
             at = height[:, foot, part], speed[:, foot, part]
-            out[:, foot, part] = _without_loose_ends(held, *at)
+            out[:, foot, part] = _without_loose_ends(held, *at, leaving)
     return out
 
 
@@ -159,15 +163,22 @@ def _held(touch: np.ndarray, stay: np.ndarray) -> np.ndarray:
 
 
 def _without_loose_ends(
-    on: np.ndarray, height: np.ndarray, speed: np.ndarray
+    on: np.ndarray, height: np.ndarray, speed: np.ndarray, leaving: float
 ) -> np.ndarray:
-    """The contact [T] without the frames at its ends in which the part leaves."""
+    """The contact [T] without the frames at its ends in which the part leaves.
+
+    Args:
+        on: the contact.
+        height: m, of the part.
+        speed: m/s, of the part.
+        leaving: m/s, above its speed in the middle, from which it leaves.
+    """
     out = on.copy()
     edges = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]])))
     for start, stop in edges.reshape(-1, 2):
         run = slice(start, stop)
         place, slow = np.percentile(height[run], 30), np.percentile(speed[run], 30)
-        loose = (height[run] > place + RISEN) | (speed[run] > slow + LEAVING)
+        loose = (height[run] > place + RISEN) | (speed[run] > slow + leaving)
         firm = np.flatnonzero(~loose)
         out[start : start + firm[0]] = False
         out[start + firm[-1] + 1 : stop] = False
