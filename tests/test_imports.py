@@ -24,7 +24,7 @@ LEVELS = [
     {"config"},
     {"training"},
     {"play", "options"},
-    {"train", "evaluate", "render", "__main__"},
+    {"train", "evaluate", "render", "export", "__main__"},
 ]
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}
 FILES = sorted(PACKAGE.rglob("*.py"))

@@ -52,7 +52,8 @@ class EnvConfig:
     touched it."""
 
     clips: tuple[str, ...] = ()
-    """Files `*.npz` or names of the package's clips; empty: the task's own choice."""
+    """Clips `*.npz`, motion files such as `*.bvh`, which are imported, or names of the
+    package's clips; empty: the task's own choice."""
 
     compliance: ComplianceConfig = field(default_factory=ComplianceConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)

@@ -1,4 +1,4 @@
-"""`dcc-jax motion import SRC... --out CLIP.npz`, and `inspect CLIP.npz`."""
+"""`dcc-jax motion import SRC... --out CLIP.npz`, `inspect` and `export`."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ PROGRAM = "dcc_jax.motion"
 COMMANDS = {
     "import": ("dcc_jax.motion.retarget.command", "turn motion files into clips"),
     "inspect": ("dcc_jax.motion.inspect_command", "look at a clip"),
+    "export": ("dcc_jax.export", "write a clip or what a policy does as BVH"),
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 from dcc_jax import runtime
@@ -11,6 +12,8 @@ from dcc_jax.env.environment import Environment
 from dcc_jax.env.task import Task
 from dcc_jax.motion.clip import Clip, load_clip
 from dcc_jax.motion.reference import make_references
+from dcc_jax.motion.retarget.importer import Options, import_motion
+from dcc_jax.motion.retarget.verdict import verdict
 from dcc_jax.tasks.registry import (
     TASKS,
     find_task,
@@ -27,6 +30,8 @@ __all__ = [
     "register_task",
     "task_name",
 ]
+
+MOTION_ENDINGS = (".bvh", ".amc", ".txt", ".json")  # of files that are imported
 
 
 def make_environment(task: Task, config: EnvConfig) -> Environment:
@@ -46,12 +51,21 @@ def make_environment(task: Task, config: EnvConfig) -> Environment:
 
 
 def _clips(task: Task, config: EnvConfig) -> list[Clip]:
-    if config.clips:
-        return [load_clip(_clip_path(clip)) for clip in config.clips]
-    return [load_clip(_clip_path(clip)) for clip in task.clips]
+    return [_clip(clip) for clip in config.clips or task.clips]
 
 
-def _clip_path(clip: str) -> Path:
-    """A file `*.npz` where it is, any other name among the package's own clips."""
-    path = Path(clip)
-    return path if path.suffix == ".npz" else asset_path(f"motions/{clip}.npz")
+def _clip(name: str) -> Clip:
+    """A clip `*.npz`, a motion file that is imported, or one of the package's clips.
+
+    Raises:
+        MotionError: a file that cannot be read.
+        FileNotFoundError: the package has no such clip.
+    """
+    path = Path(name)
+    if path.suffix == ".npz":
+        return load_clip(path)
+    if path.suffix.lower() in MOTION_ENDINGS:
+        imported = import_motion(path, Options())
+        print(f"{name}: imported; {verdict(imported.doubts)}", file=sys.stderr)
+        return imported.clip
+    return load_clip(asset_path(f"motions/{name}.npz"))
