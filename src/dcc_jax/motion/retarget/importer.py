@@ -33,6 +33,7 @@ from dcc_jax.motion.retarget.verdict import doubts
 
 FORMATS = ("amc", "bvh", "deepmimic", "npz")
 LEGS = (0.2, 2.0)  # m, of thigh and shin of any person, by which a given unit is checked
+BONES = ("thigh", "shin", "upper_arm")  # without which there is no figure
 _HEAD = 4096  # bytes that tell the format
 
 
@@ -169,6 +170,8 @@ def import_motion(
         raise
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
         raise MotionError(path, str(error)) from None
+    except LookupError as error:
+        raise MotionError(path, f"is no motion of a figure ({error})") from None
     except MemoryError:
         raise MotionError(path, "too long to hold in memory") from None
 
@@ -183,7 +186,7 @@ def _imported(motion: Motion, options: Options) -> Retargeted:
     if options.loop:
         motion = replace(motion, loop=False)
     figure = with_sides(Anatomy(motion, bodies), options.sides)
-    check_unit(figure, options.unit)
+    check_lengths(figure, options.unit)
     refuse_swapped_sides(figure)
     result = retarget(
         figure, options.fps, options.up, options.low_pass, options.clean, part
@@ -209,12 +212,16 @@ def _guesses(notes: Sequence[str]) -> tuple[str, ...]:
     )
 
 
-def check_unit(figure: Anatomy, unit: str | None) -> None:
-    """Checks a unit that the user gave: the legs tell the scale of a figure.
+def check_lengths(figure: Anatomy, unit: str | None) -> None:
+    """Checks the bones, and a unit that the user gave: the legs tell the scale.
 
     Raises:
-        MotionError: nobody has such legs.
+        MotionError: a bone has no length, or nobody has such legs.
     """
+    for bone in (f"{s}_{part}" for s in ("left", "right") for part in BONES):
+        length = np.median(np.linalg.norm(figure.bone(bone), axis=1))
+        if not length > 1e-6 * figure.leg_length > 0.0:
+            raise MotionError(figure.motion.path, f"{bone} has no length")
     if unit is None:
         return
     legs = figure.leg_length * UNITS[unit]
