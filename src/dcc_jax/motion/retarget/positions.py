@@ -27,7 +27,8 @@ from dcc_jax.motion.retarget.words import SIDES
 
 PELVIS_OFF = math.radians(8.0)  # of the line through the hips in the pelvis's frame
 CHEST_OFF = math.radians(35.0)  # of that through the shoulders: collars move
-STEADY = 0.93  # length of the mean of unit axes; below, the bone twists at random
+STEADY = 0.98  # length of the mean of unit axes; below, the bone twists at random
+NEARLY = 0.995  # ... and below this, where another one does
 BENT = 0.03  # mean square sine of a knee or elbow from which its axis counts
 UNTWISTED = 0.02  # weight of no twist against the square sine of the joint
 EASE = 0.07  # s, over which twists are smoothed
@@ -39,15 +40,16 @@ def denied_by_positions(figure: Anatomy) -> tuple[bool, list[str]]:
         _off(figure, "pelvis", "thigh") > PELVIS_OFF
         or _off(figure, "chest", "upper_arm") > CHEST_OFF
     )
-    limbs = []
+    steady = {}
     for side in SIDES:
         for upper, lower in (HINGED[:2], HINGED[2:]):
             axis, surely = figure.hinge(f"{side}_{upper}")
             mean = surely @ figure.within(f"{side}_{upper}", axis)
-            mean = np.linalg.norm(mean) / max(surely.sum(), 1e-9)
-            if surely.mean() > BENT and mean < STEADY:
-                limbs += [f"{side}_{upper}", f"{side}_{lower}"]
-    return trunk, limbs
+            length = float(np.linalg.norm(mean)) / max(float(surely.sum()), 1e-9)
+            limb = (f"{side}_{upper}", f"{side}_{lower}")
+            steady[limb] = length if surely.mean() > BENT else 1.0
+    limit = NEARLY if min(steady.values()) < STEADY else 0.0
+    return trunk, [bone for limb, at in steady.items() if at < limit for bone in limb]
 
 
 def _off(figure: Anatomy, segment: str, part: str) -> float:
