@@ -103,11 +103,11 @@ class Chain:
 
 def best_pair(
     tree: Tree, parts: tuple[str, str, str]
-) -> tuple[tuple[Chain, Chain] | None, list[str]]:
+) -> tuple[tuple[Chain | None, Chain | None], list[str]]:
     """The best chains of the left and of the right side for a kind of limb.
 
     Returns:
-        The chains, none where there are none; and the bodies for which another joint
+        The chains, none where there is none; and the bodies for which another joint
         would fit as well, with both names.
     """
     left, right = (_side_chains(tree, side, parts) for side in ("left", "right"))
@@ -123,7 +123,8 @@ def best_pair(
             pairs.append((one.score + two.score - UNEQUAL * unequal, one, two))
     pairs.sort(key=lambda pair: -pair[0])
     if not pairs:
-        return None, []
+        first, second = (chains[0] if chains else None for chains in (left, right))
+        return (first, None if first else second), []
     score, *best = pairs[0]
     doubts = []
     for other_score, *other in pairs[1:]:

@@ -36,8 +36,8 @@ def match(
     for parts in (LEG, ARM):
         pair, unclear = best_pair(tree, parts)
         doubts += unclear
-        for side, chain in zip(SIDES, pair or (), strict=False):
-            for part, node in zip(parts, chain.nodes, strict=True):
+        for side, chain in zip(SIDES, pair, strict=True):
+            for part, node in zip(parts, chain.nodes if chain else (), strict=False):
                 bodies.setdefault(f"{side}_{part}", node)
     if doubts:
         reason = f"cannot tell {', '.join(doubts)}; say which with --map"
