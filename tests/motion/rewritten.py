@@ -55,7 +55,12 @@ def joints() -> list[Joint]:
         upper, thigh = body[f"{low}_forearm"], body[f"{low}_shin"]
         rows += [
             (f"{side}Shoulder", "Spine2", (*(shoulder * [1, 0.3, 1]),), "chest"),
-            (f"{side}Arm", f"{side}Shoulder", (*(shoulder * [0, 0.7, 0]),), f"{low}_upper_arm"),
+            (
+                f"{side}Arm",
+                f"{side}Shoulder",
+                (*(shoulder * [0, 0.7, 0]),),
+                f"{low}_upper_arm",
+            ),
             (f"{side}ForeArm", f"{side}Arm", (*upper,), f"{low}_forearm"),
             (f"{side}Hand", f"{side}ForeArm", (0.0, 0.24 * out, 0.0), f"{low}_forearm"),
             (f"{side}UpLeg", "Hips", (*hip,), f"{low}_thigh"),
@@ -120,8 +125,12 @@ class Rig:
             parent = by_name.get(joint.parent)
             turned = parent.frame.inv().apply(joint.offset) if parent else joint.offset
             offset = self.scale * self.axes @ turned
-            lines.append(f"{pad}{'JOINT' if parent else 'ROOT'} {self.prefix}{joint.name}")
-            lines.append(pad + "{\n" + pad + "\tOFFSET {:.6f} {:.6f} {:.6f}".format(*offset))
+            lines.append(
+                f"{pad}{'JOINT' if parent else 'ROOT'} {self.prefix}{joint.name}"
+            )
+            lines.append(
+                pad + "{\n" + pad + "\tOFFSET {:.6f} {:.6f} {:.6f}".format(*offset)
+            )
             places = "Xposition Yposition Zposition " * (joint.name in self.placed)
             turns = " ".join(f"{axis}rotation" for axis in self.order)
             lines.append(f"{pad}\tCHANNELS {6 if places else 3} {places}{turns}")
@@ -130,7 +139,9 @@ class Rig:
             for child in children:
                 write(child, depth + 1)
             if not children:
-                lines.append(f"{pad}\tEnd Site\n{pad}\t{{\n{pad}\tOFFSET 0 0 0\n{pad}\t}}")
+                lines.append(
+                    f"{pad}\tEnd Site\n{pad}\t{{\n{pad}\tOFFSET 0 0 0\n{pad}\t}}"
+                )
             lines.append(pad + "}")
 
         for joint in self.joints:
@@ -144,7 +155,9 @@ class Rig:
             if above is not None and above.turns:
                 own = (world[above.turns] * above.frame).inv() * own
             if joint.name in self.placed:
-                columns.append(self.scale * clip.qpos[:, :3].astype(float) @ self.axes.T)
+                columns.append(
+                    self.scale * clip.qpos[:, :3].astype(float) @ self.axes.T
+                )
             local = change * own * change.inv()
             columns.append(local.as_euler(self.order, degrees=True))
         rows = np.concatenate(columns, axis=1)

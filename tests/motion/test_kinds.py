@@ -77,11 +77,15 @@ def test_all_bones_may_lie_along_one_axis(tmp_path, truth, axes):
 def test_position_channels_count_below_a_root_that_moves(tmp_path):
     """The root turns and shifts, and the hips have positions of their own."""
     rig = Rig()
-    rig = replace(rig, joints=[Joint("Reference", "", (0.0, 0.0, 0.0), ""), *rig.joints])
+    rig = replace(
+        rig, joints=[Joint("Reference", "", (0.0, 0.0, 0.0), ""), *rig.joints]
+    )
     rig = replace(
         rig,
         joints=[
-            replace(j, parent="Reference", offset=(0.0, 0.0, 0.935)) if j.name == "Hips" else j
+            replace(j, parent="Reference", offset=(0.0, 0.0, 0.935))
+            if j.name == "Hips"
+            else j
             for j in rig.joints
         ],
         placed=frozenset(("Hips",)),
@@ -108,7 +112,9 @@ def test_without_travel_the_standing_foot_stays(tmp_path):
     assert any("nothing of where the figure goes" in note for note in result.notes)
     assert any("from the feet" in doubt for doubt in result.doubts)
     way = np.linalg.norm(result.clip.qpos[-1, :2])
-    assert way == pytest.approx(np.linalg.norm((WALK.qpos[-1] - WALK.qpos[0])[:2]), abs=0.03)
+    assert way == pytest.approx(
+        np.linalg.norm((WALK.qpos[-1] - WALK.qpos[0])[:2]), abs=0.03
+    )
 
 
 @pytest.mark.parametrize("scale", [1.0, 10.0, 100.0, 1000.0, 3.281, 11.96])
@@ -128,7 +134,10 @@ def with_first(text: str, rows: list[str]) -> str:
     lines = text.splitlines()
     at = next(k for k, line in enumerate(lines) if line.startswith("Frame Time")) + 1
     count = len(lines) - at
-    lines = [line.replace(f"Frames: {count}", f"Frames: {count + len(rows)}") for line in lines]
+    lines = [
+        line.replace(f"Frames: {count}", f"Frames: {count + len(rows)}")
+        for line in lines
+    ]
     return "\n".join([*lines[:at], *rows, *lines[at:]]) + "\n"
 
 
@@ -152,7 +161,9 @@ def test_a_motion_that_begins_fast_keeps_its_first_frame(tmp_path):
         same(imported(tmp_path, Rig().text(clip), clean=False), clip)
 
 
-@pytest.mark.parametrize("seconds", ["0.033333", "0.0333", "0.03333333", "0.0333333333"])
+@pytest.mark.parametrize(
+    "seconds", ["0.033333", "0.0333", "0.03333333", "0.0333333333"]
+)
 def test_a_rounded_frame_time_loses_no_frame(tmp_path, seconds):
     text = Rig().text(WALK)
     line = next(row for row in text.splitlines() if row.startswith("Frame Time"))
@@ -229,7 +240,9 @@ def lying(frames: int = 40) -> Clip:
     qpos[:, :3] = [0.4, 0.2, 0.12]
     qpos[:, 0] += 0.01 * np.sin(np.arange(frames) / 5.0)
     qpos[:, 15:19] = WALK.qpos[:frames, 15:19]
-    qpos[:, 3:7] = Rotation.from_euler("y", -90.0, degrees=True).as_quat(scalar_first=True)
+    qpos[:, 3:7] = Rotation.from_euler("y", -90.0, degrees=True).as_quat(
+        scalar_first=True
+    )
     return replace(clip, qpos=qpos.astype(np.float32))
 
 
@@ -275,7 +288,9 @@ def made_up(text: str, clip: Clip, seed: int) -> str:
             (lower, lambda turn, twist=twist: twist.inv() * turn),
         ):
             column = 3 + 3 * order.index(name)
-            turn = Rotation.from_euler("ZXY", values[:, column : column + 3], degrees=True)
+            turn = Rotation.from_euler(
+                "ZXY", values[:, column : column + 3], degrees=True
+            )
             values[:, column : column + 3] = change(turn).as_euler("ZXY", degrees=True)
     lines[at:] = [" ".join(f"{value:.6f}" for value in row) for row in values]
     return "\n".join(lines) + "\n"

@@ -30,13 +30,13 @@ def names(pattern: str, words: str, *, spine: str) -> dict[str, str]:
         spine: hips, three of the spine, neck and head.
     """
     left, right, *parts = words.split()
-    theirs = "UpLeg Leg Foot ToeBase Shoulder Arm ForeArm Hand".split()
+    theirs = ["UpLeg", "Leg", "Foot", "ToeBase", "Shoulder", "Arm", "ForeArm", "Hand"]
     sided = {
         f"{ours}{part}": pattern.format(side=side, part=word)
         for ours, side in (("Left", left), ("Right", right))
         for part, word in zip(theirs, parts, strict=True)
     }
-    middle = "Hips Spine Spine1 Spine2 Neck Head".split()
+    middle = ["Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"]
     return sided | dict(zip(middle, spine.split(), strict=True))
 
 
@@ -189,7 +189,9 @@ def test_arms_that_hang_on_the_neck_leave_the_chest_to_the_spine(tmp_path):
     shifted = [
         replace(j, parent="Neck", offset=(j.offset[0], j.offset[1], 0.0))
         if j.name.endswith("Shoulder")
-        else replace(j, turns="head") if j.name == "Neck" else j
+        else replace(j, turns="head")
+        if j.name == "Neck"
+        else j
         for j in Rig().joints
     ]
     result = imported(tmp_path, replace(Rig(), joints=shifted).text(clip), clean=False)

@@ -24,7 +24,9 @@ KNEES = (7, 10)  # of the joints
 
 def down(side: str, degrees: float) -> Rotation:
     """Axes of an arm whose zero pose hangs so far below a T-pose."""
-    return Rotation.from_euler("x", degrees if side == "Left" else -degrees, degrees=True)
+    return Rotation.from_euler(
+        "x", degrees if side == "Left" else -degrees, degrees=True
+    )
 
 
 def arms(degrees: float) -> dict[str, Rotation]:

@@ -64,5 +64,5 @@ def read_archive(path: str | Path, fps: float | None = None) -> Motion:
 def _refusal(kind: str, program: str, stem: str) -> str:
     return (
         f"a pickle, which could run code, is not loaded; if it is a {kind} motion "
-        f"and you trust it, convert it: python -c \"{program.format(stem)}\""
+        f'and you trust it, convert it: python -c "{program.format(stem)}"'
     )

@@ -17,7 +17,7 @@ from dcc_jax.motion.formats.text import read_text
 
 FRAME_SIZE = 44
 MAX_FPS = 240.0
-LEAST_FRAMES = 20_000
+LEAST_FRAMES = 3_000
 MOST_A_KEY = 50
 """Unequal durations are met by more frames than keys, but the file's size bounds them:
 at most these, or so many a key."""

@@ -138,5 +138,3 @@ def rest_on_frame(motion: Motion, frame: int) -> Motion:
             node: at_parent[node].apply(move) for node, move in motion.moves.items()
         },
     )
-
-

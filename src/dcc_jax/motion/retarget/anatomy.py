@@ -65,7 +65,11 @@ class Anatomy:
 
     def _carrier(self, body: str) -> int:
         end = ENDS.get(body)
-        if end in self.bodies and body.partition("_")[2] in ("thigh", "shin", "upper_arm"):
+        if end in self.bodies and body.partition("_")[2] in (
+            "thigh",
+            "shin",
+            "upper_arm",
+        ):
             return self.motion.parents[self.bodies[end]]
         return self.bodies[body]
 

@@ -70,7 +70,9 @@ def bvh_text(clip: Clip) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _write_segment(lines: list[str], order: list[int], segment: int, depth: int) -> None:
+def _write_segment(
+    lines: list[str], order: list[int], segment: int, depth: int
+) -> None:
     """A segment and all that hangs on it; its channels join the order of the rows."""
     pad = "\t" * depth
     name = SEGMENTS[segment]
@@ -86,7 +88,9 @@ def _write_segment(lines: list[str], order: list[int], segment: int, depth: int)
         _end(lines, pad + "\t", ENDS["head"])
     elif part == "foot":
         toe = ENDS["foot"]
-        _write_tip(lines, order, depth, f"{side.title()}ToeBase", toe, (TIPS["foot"], 0, 0))
+        _write_tip(
+            lines, order, depth, f"{side.title()}ToeBase", toe, (TIPS["foot"], 0, 0)
+        )
     elif part == "forearm":
         hand, tip = (0.0, out * HAND, 0.0), (0.0, out * TIPS["hand"], 0.0)
         _write_tip(lines, order, depth, f"{side.title()}Hand", hand, tip)
@@ -118,9 +122,16 @@ def _open(lines: list[str], pad: str, offset, places: str) -> None:
 
 
 def _end(lines: list[str], pad: str, offset) -> None:
-    lines += [f"{pad}End Site", f"{pad}{{", f"{pad}\tOFFSET {_triple(offset)}", f"{pad}}}"]
+    lines += [
+        f"{pad}End Site",
+        f"{pad}{{",
+        f"{pad}\tOFFSET {_triple(offset)}",
+        f"{pad}}}",
+    ]
 
 
 def _triple(offset) -> str:
     """An offset in the file's axes and unit."""
-    return " ".join(f"{value:.6f}" for value in SCALE * AXES @ np.asarray(offset, float))
+    return " ".join(
+        f"{value:.6f}" for value in SCALE * AXES @ np.asarray(offset, float)
+    )

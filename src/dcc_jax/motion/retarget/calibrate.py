@@ -27,9 +27,13 @@ from dcc_jax.motion.retarget.figure import SEGMENTS
 from dcc_jax.motion.retarget.words import SIDES
 
 SPREAD = math.radians(12.0)  # legs spread further have feet square to them
-BENT = 0.03  # mean square sine of a knee or elbow from which its axis counts: 10 degrees
+BENT = (
+    0.03  # mean square sine of a knee or elbow from which its axis counts: 10 degrees
+)
 STEADY = 0.9  # length of the mean of unit axes that are one axis
-OTHER = math.cos(math.radians(50.0))  # a zero pose whose hinges are off by more is wrong
+OTHER = math.cos(
+    math.radians(50.0)
+)  # a zero pose whose hinges are off by more is wrong
 STRAIGHT = math.cos(math.radians(20.0))  # of a spine in the zero pose
 SOLE = math.radians(25.0)  # by which the line from ankle to toes falls, standing
 
@@ -182,9 +186,7 @@ def _head_bone(figure: Anatomy, otherwise: np.ndarray) -> np.ndarray:
     return otherwise
 
 
-def _limb(
-    figure: Anatomy, segment: str, frames: dict[str, np.ndarray]
-) -> np.ndarray:
+def _limb(figure: Anatomy, segment: str, frames: dict[str, np.ndarray]) -> np.ndarray:
     """A bone's direction from its joints, its twist from the hinge or its parent."""
     bone = figure.within(segment, unit(figure.bone(segment))).mean(axis=0)
     side, _, part = segment.partition("_")
@@ -216,7 +218,9 @@ def _foot(
     left = figure.within(foot, world.apply([0.0, 1.0, 0.0])).mean(axis=0)
     toes = figure.within(foot, unit(figure.bone(foot))).mean(axis=0)
     if not toes.any():
-        return frame(figure.within(foot, world.apply([0.0, 0.0, 1.0])).mean(axis=0), left)
+        return frame(
+            figure.within(foot, world.apply([0.0, 0.0, 1.0])).mean(axis=0), left
+        )
     toes = unit(toes)
     pitch = Rotation.from_rotvec(-_fall(figure, foot, up) * across(left, toes))
     ahead = pitch.apply(toes)

@@ -191,7 +191,9 @@ def _chain(
     end_score: float,
 ) -> Chain | None:
     """Three joints as a limb; None where they cannot be one."""
-    scores = [_fit(tree, side, part, node) for part, node in zip(parts, nodes, strict=False)]
+    scores = [
+        _fit(tree, side, part, node) for part, node in zip(parts, nodes, strict=False)
+    ]
     given = [tree.given.get(f"{side}_{part}") for part in parts]
     sided = [
         tree.named[node].side == side or node == known

@@ -33,6 +33,8 @@ from dcc_jax.motion.retarget.legs import REACH, reach_feet
 
 UNKNOWNS = 15
 ROUNDS = 8
+WINDOW = 1500  # frames that are corrected at once
+FADE = 1.5  # s, that two windows have in common
 ROOT, FOOT = slice(0, 3), (slice(3, 9), slice(9, 15))
 # Weights, relative to a correction of 1 m; turns count by their lever of about 0.2 m.
 LEVER = 0.2  # m
@@ -66,15 +68,38 @@ def clean_feet(
     root = clip.qpos[:, :3].astype(float)
     positions = body.positions(root, world)
     start = _Pose(root, positions[:, list(THIGHS)], positions[:, list(FEET)], world)
-    now = _settled(body, start, contacts, free, clip.fps)
+    now = start.changed(_correction(body, start, contacts, free, clip.fps))
     reached = reach_feet(body, now.root, world, now.ankles, now.feet)
     return replace(clip, qpos=qpos_of(now.root, reached))
 
 
+def _correction(
+    body: Figure, start: _Pose, contacts: np.ndarray, free: np.ndarray, fps: float
+) -> np.ndarray:
+    """The correction [T, 15], in windows that fade into each other.
+
+    What stands at one time does not matter to another, so that memory need not grow
+    with the length of a recording.
+    """
+    frames, fade = len(start.root), round(FADE * fps)
+    total, weights = np.zeros((frames, UNKNOWNS)), np.zeros((frames, 1))
+    for first in range(0, max(1, frames - fade), WINDOW - fade):
+        part = slice(first, min(first + WINDOW, frames))
+        change = _settled(body, start.part(part), contacts[part], free[part], fps)
+        weight = np.ones(len(change))
+        if first:
+            weight[:fade] = (np.arange(fade) + 0.5)[: len(weight)] / fade
+        if part.stop < frames:
+            weight[-fade:] = 1.0 - (np.arange(fade) + 0.5) / fade
+        total[part] += weight[:, None] * change
+        weights[part] += weight[:, None]
+    return total / weights
+
+
 def _settled(
     body: Figure, start: _Pose, contacts: np.ndarray, free: np.ndarray, fps: float
-) -> _Pose:
-    """The pose after as many corrections as it takes.
+) -> np.ndarray:
+    """The correction [T, 15] after as many rounds as it takes.
 
     An inequality acts from when it is broken for as long as it pushes, which the last
     linear solution tells; what the pose itself tells would switch it on and off.
@@ -103,7 +128,7 @@ def _settled(
         floored &= low + np.einsum("tfki,tfi->tfk", moves[..., 2, :], feet) < least
         apart = feet[..., :3] - step[:, None, ROOT]
         taut &= excess + np.einsum("tfi,tfi->tf", along, apart) > 0.0
-    return start.changed(change)
+    return change
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +144,11 @@ class _Pose:
     def feet(self) -> np.ndarray:
         """World rotations [T, 2, 4] of the feet."""
         return self.world[:, list(FEET)]
+
+    def part(self, frames: slice) -> _Pose:
+        """The pose in some frames."""
+        fields = (self.root, self.hips, self.ankles, self.world)
+        return _Pose(*(array[frames] for array in fields))
 
     def changed(self, change: np.ndarray) -> _Pose:
         """The pose after the correction [T, 15]; only the feet's rotations change."""
@@ -264,7 +294,11 @@ def _stop(
 
 
 def _keep_length(
-    equations: Equations, frames: int, excess: np.ndarray, along: np.ndarray, taut: np.ndarray
+    equations: Equations,
+    frames: int,
+    excess: np.ndarray,
+    along: np.ndarray,
+    taut: np.ndarray,
 ) -> None:
     """Legs are never longer than they are."""
     for side in range(2):

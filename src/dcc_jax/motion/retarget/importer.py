@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dcc_jax.motion.formats.archive import is_archive, read_archive
 from dcc_jax.motion.formats.asf import is_asf
 from dcc_jax.motion.formats.asf_amc import (
     DEFAULT_FPS,
@@ -17,7 +18,6 @@ from dcc_jax.motion.formats.asf_amc import (
     read_amc,
     skeletons_beside,
 )
-from dcc_jax.motion.formats.archive import is_archive, read_archive
 from dcc_jax.motion.formats.bvh import is_bvh, read_bvh
 from dcc_jax.motion.formats.deepmimic import is_deepmimic, read_deepmimic
 from dcc_jax.motion.formats.npz import MotionError
@@ -32,7 +32,10 @@ from dcc_jax.motion.retarget.sides import SIDES, refuse_swapped_sides, with_side
 from dcc_jax.motion.retarget.verdict import doubts
 
 FORMATS = ("amc", "bvh", "deepmimic", "npz")
-LEGS = (0.2, 2.0)  # m, of thigh and shin of any person, by which a given unit is checked
+LEGS = (
+    0.2,
+    2.0,
+)  # m, of thigh and shin of any person, by which a given unit is checked
 BONES = ("thigh", "shin", "upper_arm")  # without which there is no figure
 _HEAD = 4096  # bytes that tell the format
 

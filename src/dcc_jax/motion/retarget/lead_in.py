@@ -35,7 +35,9 @@ def without_rest_pose(figure: Anatomy) -> Motion:
         if steps[frame].max() > JUMP:
             after = steps[frame + 1 : frame + 1 + WINDOW]
             moved = np.sort(steps[frame])[-4:].mean()
-            outlier = moved > OUTLIER * np.sort(after, axis=1)[:, -4:].mean(axis=1).max()
+            outlier = (
+                moved > OUTLIER * np.sort(after, axis=1)[:, -4:].mean(axis=1).max()
+            )
             if outlier and _is_rest_pose(figure, ways[frame]):
                 return _after(motion, frame + 1)
             return motion

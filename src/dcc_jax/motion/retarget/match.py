@@ -123,11 +123,15 @@ def _head(tree: Tree, bodies: Mapping[str, int], shoulders: int) -> int | None:
             continue
         above.append(node)
         waiting += tree.children[node]
-    called = [n for n in above if tree.named[n].score("head") and not tree.named[n].aside]
+    called = [
+        n for n in above if tree.named[n].score("head") and not tree.named[n].aside
+    ]
     if called:
         return min(called, key=lambda n: len(tree.motion.ancestors(n)))
     rising = [
-        n for n in above[1:] if tree.children[n] and n not in tree.motion.ancestors(chest)
+        n
+        for n in above[1:]
+        if tree.children[n] and n not in tree.motion.ancestors(chest)
     ]
     rising = [n for n in rising if not any(limb in tree.below(n) for limb in limbs)]
     ends = [n for n in rising if not set(tree.children[n]) & set(rising)]

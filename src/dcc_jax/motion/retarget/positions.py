@@ -118,18 +118,14 @@ def _trunk(figure: Anatomy, rest_axes: np.ndarray | None) -> dict[str, Rotation]
     return out
 
 
-def _head(
-    figure: Anatomy, chest: Rotation, rest_axes: np.ndarray | None
-) -> Rotation:
+def _head(figure: Anatomy, chest: Rotation, rest_axes: np.ndarray | None) -> Rotation:
     """The head: up along its bone, its face where the chest faces."""
     upward = np.array([0.0, 0.0, 1.0]) if rest_axes is None else rest_axes[2]
     left = chest.apply([0.0, 1.0, 0.0])
     return Rotation.from_matrix(frame(figure.turns["head"].apply(upward), left))
 
 
-def _twisted(
-    figure: Anatomy, segment: str, world: dict[str, Rotation]
-) -> Rotation:
+def _twisted(figure: Anatomy, segment: str, world: dict[str, Rotation]) -> Rotation:
     """A bone along its joints, turned about itself until knee or elbow is a hinge.
 
     Where the joint is straight its axis says nothing: there the bone takes the shortest

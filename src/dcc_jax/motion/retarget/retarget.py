@@ -32,7 +32,9 @@ from dcc_jax.motion.retarget.travel import root_stays, walked_path
 from dcc_jax.motion.retarget.words import SIDES
 
 LOW_PASS = 10.0  # Hz, for what was recorded faster than 60 Hz
-WORK_FPS = 60.0  # frame rate for cleaning, of sources as fast, where the wanted one divides it
+WORK_FPS = (
+    60.0  # frame rate for cleaning, of sources as fast, where the wanted one divides it
+)
 WORST_POSE = 8.0  # degrees of mean pose error; standing feet ask for less than 3
 ATTEMPTS = 6  # at cleaning, each of which leaves more of the feet alone
 LAP = 0.5  # s, of its neighbours that a loop is cleaned with
@@ -181,7 +183,8 @@ def bones_off(figure: Anatomy, world: np.ndarray) -> Notes:
     limbs = [f"{side}_{part}" for side in SIDES for part in HINGED]
     theirs = np.stack([unit(figure.bone(limb)) for limb in limbs], axis=1)
     ours = np.stack(
-        [to_rotation(world[:, SEGMENTS.index(s)]).apply(along(s)) for s in limbs], axis=1
+        [to_rotation(world[:, SEGMENTS.index(s)]).apply(along(s)) for s in limbs],
+        axis=1,
     )
     frames = slice(None, None, max(1, len(ours) // 500))
     turn, _ = Rotation.align_vectors(

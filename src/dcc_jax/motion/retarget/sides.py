@@ -27,7 +27,9 @@ def with_sides(figure: Anatomy, how: str) -> Anatomy:
     if how == "swap":
         other = {"left": "right", "right": "left"}
         bodies = {
-            f"{other[head]}_{part}" if (head := body.partition("_")[0]) in other else body: node
+            f"{other[head]}_{part}"
+            if (head := body.partition("_")[0]) in other
+            else body: node
             for body, node in figure.bodies.items()
             for part in [body.partition("_")[2]]
         }

@@ -41,7 +41,8 @@ def walked_path(world: np.ndarray) -> np.ndarray:
         point = both[..., 2].max(axis=0).argmin()
         step = both[1, point] - both[0, point]
         turn = (
-            to_rotation(world[t, feet[foot]]) * to_rotation(world[t - 1, feet[foot]]).inv()
+            to_rotation(world[t, feet[foot]])
+            * to_rotation(world[t - 1, feet[foot]]).inv()
         )
         rolled = np.cross(turn.as_rotvec(), [0.0, 0.0, body.radius])
         path[t] = path[t - 1] - step + rolled

@@ -61,14 +61,18 @@ def _ranges(quality: Quality) -> str:
 def _knees(clip: Clip) -> str:
     vectors = to_rotation(split_qpos(clip.qpos)[1][:, 1:]).as_rotvec(degrees=True)
     least = vectors[:, KNEES, 1].min()
-    return f"a knee bends forwards by {-least:.0f} degrees" if -least > BACKWARDS else ""
+    return (
+        f"a knee bends forwards by {-least:.0f} degrees" if -least > BACKWARDS else ""
+    )
 
 
 def _speeds(clip: Clip) -> str:
     turns = to_rotation(split_qpos(clip.qpos)[1])
     steps = np.degrees((turns[:-1].inv() * turns[1:]).magnitude()) * clip.fps
     if steps[:, 1:].max() > TURN:
-        return f"a joint turns by {steps[:, 1:].max() / clip.fps:.0f} degrees in a frame"
+        return (
+            f"a joint turns by {steps[:, 1:].max() / clip.fps:.0f} degrees in a frame"
+        )
     way = np.linalg.norm(np.diff(clip.qpos[:, :3].astype(float), axis=0), axis=1)
     speed = way.max() * clip.fps
     return f"the body moves at {speed:.0f} m/s" if speed > SPEED else ""

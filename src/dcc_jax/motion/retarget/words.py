@@ -37,10 +37,7 @@ _PARTS = {
     "head": "head 1 skull 1",
 }
 _ASIDE = frozenset(
-    "thumb index middle ring pinky pinkie finger fingers carpal metacarpal metatarsal "
-    "hair skirt breast eye eyes jaw ear tongue teeth tail cape cloth brow lip cheek "
-    "nose prop weapon ik pole target ctrl control goal effector socket helper rigmesh "
-    "volume corrective headtop nub tip site end null mch org twist roll dummy".split()
+    ["thumb", "index", "middle", "ring", "pinky", "pinkie", "finger", "fingers", "carpal", "metacarpal", "metatarsal", "hair", "skirt", "breast", "eye", "eyes", "jaw", "ear", "tongue", "teeth", "tail", "cape", "cloth", "brow", "lip", "cheek", "nose", "prop", "weapon", "ik", "pole", "target", "ctrl", "control", "goal", "effector", "socket", "helper", "rigmesh", "volume", "corrective", "headtop", "nub", "tip", "site", "end", "null", "mch", "org", "twist", "roll", "dummy"]
 )
 """Words of joints beside the bones: fingers, face, clothes, handles, ends."""
 _HARMLESS = frozenset(("twist", "roll"))  # in a chain they may stand for the bone
