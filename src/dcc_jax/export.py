@@ -1,4 +1,4 @@
-"""`dcc-jax motion export WHAT --out FILE.bvh`: a clip, or what a policy does, as BVH."""
+"""`dcc-jax motion export WHAT --out FILE.bvh`: a clip or a policy's motion as BVH."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """How our segments lie in the zero pose of a foreign figure: constant rotations.
 
-Where the zero pose stands, it says all. Where it does not (bones along one axis, as game
-engines export), the joint positions of the motion say where a bone points, knees and
-elbows about which axis it flexes, hips and shoulders which way the trunk faces.
+Where the zero pose stands, it says all. Where it does not (bones along one axis, as
+game engines export), the joint positions of the motion say where a bone points, knees
+and elbows about which axis it flexes, hips and shoulders which way the trunk faces.
 
 Letters: T frames. Matrices have columns forward, left and up of our segment.
 """

@@ -1,4 +1,4 @@
-"""Arms and legs in a foreign skeleton: chains that fit by name, place and length at once.
+"""Arms and legs in a foreign skeleton: chains that fit by name, place and length.
 
 A name alone deceives: `LeftShoulder` is a collar bone here and an upper arm there,
 `LeftLeg` a shin or a whole leg, and helper joints carry the names of bones. So whole

@@ -1,4 +1,4 @@
-"""Frames that are no motion: a T-pose before it, and repeats that only raise the rate."""
+"""Frames that are no motion: a T-pose before it, and repeats that raise the rate."""
 
 from __future__ import annotations
 

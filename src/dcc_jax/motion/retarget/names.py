@@ -1,4 +1,4 @@
-"""The joints of our body that a foreign skeleton has to have, and maps of their names."""
+"""The joints that a foreign skeleton has to have, and maps of their names."""
 
 from __future__ import annotations
 

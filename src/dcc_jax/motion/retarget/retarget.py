@@ -65,7 +65,7 @@ def retarget(
 ) -> Retargeted:
     """A clip of our body from a figure in its own axes and unit.
 
-    How the figure's bones lie and where its up is, all frames tell, whichever are taken.
+    All frames tell how its bones lie and where up is, whichever are taken.
 
     Args:
         figure: the source, with our joints found in it.

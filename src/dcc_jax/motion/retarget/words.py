@@ -1,7 +1,7 @@
 """What the name of a joint says: its side, and how well it fits each part of a body.
 
-Names come as `mixamorig:LeftUpLeg`, `Actor 07_LeftArm`, `CC_Base_L_Thigh`, `lShldrBend`,
-`thigh.L`, `Bip01 R Calf`, `lfemur`: words in some order, among them a side and a part.
+Names come as `mixamorig:LeftUpLeg`, `Actor 07_LeftArm`, `CC_Base_L_Thigh`, `thigh.L`,
+`Bip01 R Calf`, `lShldrBend`, `lfemur`: words in some order, among them a side and a part.
 """
 
 from __future__ import annotations
@@ -37,7 +37,14 @@ _PARTS = {
     "head": "head 1 skull 1",
 }
 _ASIDE = frozenset(
-    ["thumb", "index", "middle", "ring", "pinky", "pinkie", "finger", "fingers", "carpal", "metacarpal", "metatarsal", "hair", "skirt", "breast", "eye", "eyes", "jaw", "ear", "tongue", "teeth", "tail", "cape", "cloth", "brow", "lip", "cheek", "nose", "prop", "weapon", "ik", "pole", "target", "ctrl", "control", "goal", "effector", "socket", "helper", "rigmesh", "volume", "corrective", "headtop", "nub", "tip", "site", "end", "null", "mch", "org", "twist", "roll", "dummy"]
+    re.findall(
+        r"\w+",
+        "thumb index middle ring pinky pinkie finger fingers carpal metacarpal "
+        "metatarsal hair skirt breast eye eyes jaw ear tongue teeth tail cape cloth "
+        "brow lip cheek nose prop weapon ik pole target ctrl control goal effector "
+        "socket helper rigmesh volume corrective headtop nub tip site end null mch org "
+        "twist roll dummy",
+    )
 )
 """Words of joints beside the bones: fingers, face, clothes, handles, ends."""
 _HARMLESS = frozenset(("twist", "roll"))  # in a chain they may stand for the bone
