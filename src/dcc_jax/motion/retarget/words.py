@@ -1,7 +1,7 @@
 """What the name of a joint says: its side, and how well it fits each part of a body.
 
 Names come as `mixamorig:LeftUpLeg`, `Actor 07_LeftArm`, `CC_Base_L_Thigh`, `thigh.L`,
-`Bip01 R Calf`, `lShldrBend`, `lfemur`: words in some order, among them a side and a part.
+`Bip01 R Calf`, `lShldrBend`, `lfemur`: words in some order, with a side and a part.
 """
 
 from __future__ import annotations
