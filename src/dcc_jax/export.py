@@ -95,7 +95,8 @@ def _played(options: Options) -> Clip:
     )
     assert recording.motion is not None
     alive = recording.alive[:, 0]
-    qpos = environment.scene.character_qpos(np.asarray(recording.motion.qpos))[alive, 0]
+    character_qpos = environment.scene.character_qpos(recording.motion.qpos)
+    qpos = np.asarray(character_qpos)[alive, 0]
     if len(qpos) < 2:
         raise ValueError(f"{run.name} falls at once: nothing to write")
     frames = join_qpos(*split_qpos(qpos))

@@ -64,7 +64,7 @@ class Anatomy:
         }
 
     def _carrier(self, body: str) -> int:
-        end = ENDS.get(body)
+        end = ENDS.get(body, "")
         if end in self.bodies and body.partition("_")[2] in (
             "thigh",
             "shin",

@@ -52,7 +52,7 @@ class Judgement:
 
     def reasons(self) -> str:
         """What got worse, in words."""
-        found = self.worse.any(axis=(0, 1))
+        found = [bool(self.worse[..., kind].any()) for kind in range(len(KINDS))]
         return ", ".join(kind for kind, on in zip(KINDS, found, strict=True) if on)
 
 

@@ -148,7 +148,7 @@ def _toes(tree: Tree, bodies: dict[str, int]) -> None:
         below = named or [n for n in tree.children[foot] if not tree.named[n].aside]
         below = [n for n in below if tree.distance(n, foot) > 0.0]
         if below:
-            bodies[f"{side}_toe"] = min(below, key=lambda n: tree.walked(foot, n))
+            bodies[f"{side}_toe"] = min((tree.walked(foot, n), n) for n in below)[1]
 
 
 def _common_ancestor(motion: Motion, a: int | None, b: int | None) -> int | None:

@@ -187,9 +187,9 @@ def bones_off(figure: Anatomy, world: np.ndarray) -> Notes:
         axis=1,
     )
     frames = slice(None, None, max(1, len(ours) // 500))
-    turn, _ = Rotation.align_vectors(
+    turn = Rotation.align_vectors(
         ours[frames].reshape(-1, 3), theirs[frames].reshape(-1, 3)
-    )
+    )[0]
     turned = turn.apply(theirs.reshape(-1, 3)).reshape(theirs.shape)
     cosine = np.clip((turned * ours).sum(-1), -1.0, 1.0)
     off = np.where(theirs.any(axis=-1), np.degrees(np.arccos(cosine)), 0.0).mean(axis=0)
