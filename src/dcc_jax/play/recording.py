@@ -120,6 +120,7 @@ def _numbers(
         "slip": slip,
         "stands": stands,
         "range_excess": jnp.max(mechanics.range_excess(tables, q)),
+        "r_q": state.r_q,
         "r_p": state.r_p,
         "r_task": state.r_task,
     }
