@@ -19,7 +19,7 @@ from dcc_jax.config import make_config
 from dcc_jax.play.recording import Motion, displaced
 from dcc_jax.render import film
 from dcc_jax.training.loop import make_environment
-from dcc_jax.viz import draw
+from dcc_jax.viz import draw, files
 
 # The package shows the function of that name; these tests want the module.
 command = importlib.import_module("dcc_jax.render.__main__")
@@ -185,6 +185,6 @@ def test_missing_video_extra_is_told_before_anything_is_played(
     def missing(path: object) -> None:
         raise ModuleNotFoundError("pip install 'dcc-jax[video]'")
 
-    monkeypatch.setattr(draw, "check_video", missing)
+    monkeypatch.setattr(files, "check_video", missing)
     assert command.main([str(push)]) == 2
     assert "pip install 'dcc-jax[video]'" in capsys.readouterr().err

@@ -74,9 +74,7 @@ def of(task: Task) -> list[Action]:
     if isinstance(task, HandInHand | SustainedPush):
         found += [
             Action("speed", _speed, 0.0, max(task.gaits.speeds), "m/s"),
-            Action(
-                "turn", _turn, -task.gaits.turn_rate, task.gaits.turn_rate, "rad/s"
-            ),
+            Action("turn", _turn, -task.gaits.turn_rate, task.gaits.turn_rate, "rad/s"),
         ]
     return found
 

@@ -26,7 +26,7 @@ from dcc_jax.env.state import EnvState
 from dcc_jax.env.task import Task
 from dcc_jax.play import actions, pull, stepping
 from dcc_jax.play.pull import PULL, PUSH, Hands, Pulled
-from dcc_jax.play.recording import Frame, Motion
+from dcc_jax.play.recording import Frame, Motion, displaced
 from dcc_jax.play.runs import Run, make_environment
 
 Array = jax.Array
@@ -69,6 +69,21 @@ class Program:
         pulled = self.environment.task
         assert isinstance(pulled, Pulled)
         return pulled.task
+
+    @property
+    def identity(self) -> str:
+        """Equal programs have equal ones: alpha and the policy make no difference."""
+        env = dataclasses.asdict(self.environment.config)
+        return repr((self.task, env | {"alpha": None, "alpha_max": None}))
+
+    @property
+    def first_qpos(self) -> np.ndarray:
+        """A pose [nq] to show before anything is compiled."""
+        scene = self.environment.scene
+        qpos = scene.model.qpos0.copy()
+        own = slice(scene.qpos_adr, scene.qpos_adr + scene.character.nq)
+        qpos[own] = self.environment.nominal
+        return qpos
 
     @property
     def ready(self) -> bool:
@@ -237,10 +252,21 @@ class Simulation:
             raise ValueError(f"{name!r} is none of {list(offered)}")
         self._task_state = offered[name].apply(self.task, self._task_state, value)
 
+    def ghost(self, moment: Moment) -> np.ndarray:
+        """Scene coordinates [nq] of the ghost; see `recording.displaced`."""
+        motion = jax.tree.map(np.asarray, moment.motion)
+        return displaced(self.environment, motion)
+
+    def warm_up(self) -> None:
+        """Takes a control step, and forgets it: what is slow the first time is over."""
+        self.ghost(self.step())
+        self.history.clear()
+        self.reset(episode=self.episode)
+
     @property
     def pull_force_w(self) -> np.ndarray:
-        """N [3], of the spring in the strongest moment of the last control step."""
-        return self.history[-1].motion.force_w[-pull.HANDS + PULL]
+        """N [3], of the spring on the character in the last control step."""
+        return np.asarray(self.history[-1].motion.force_w)[-pull.HANDS + PULL]
 
     @property
     def seconds_since_fall(self) -> float:
@@ -263,9 +289,7 @@ class Simulation:
         if not self.events_on:
             self._task_state = actions.waiting(self.task, self._task_state)
         own = dataclasses.replace(self.state.task, hands=self.hands)
-        state = dataclasses.replace(
-            self.state, task=own, alpha=np.float32(self.level)
-        )
+        state = dataclasses.replace(self.state, task=own, alpha=np.float32(self.level))
         if not self.u_on:
             rest = compliance.at_rest(self.environment.kinematics.coords)
             state = dataclasses.replace(state, displacement=rest)
@@ -281,13 +305,16 @@ class Simulation:
         damping: float,
         force_w: np.ndarray,
     ) -> None:
-        row = Hands(
-            body=np.asarray(0 if body is None else self._body(body)),
-            point=_finite("point", point),
-            target_w=_finite("target_w", target_w),
-            stiffness=_finite("stiffness", stiffness),
-            damping=_finite("damping", damping),
-            force_w=_finite("force_w", force_w),
+        numbers = {
+            "point": point,
+            "target_w": target_w,
+            "stiffness": stiffness,
+            "damping": damping,
+            "force_w": force_w,
+        }
+        row: Any = Hands(
+            body=0 if body is None else self._body(body),  # pyright: ignore
+            **{name: _finite(name, value) for name, value in numbers.items()},  # pyright: ignore
         )
 
         def placed(rows: np.ndarray, own: np.ndarray) -> np.ndarray:

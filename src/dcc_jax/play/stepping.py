@@ -6,6 +6,8 @@ the number of the control step alone, whoever plays it.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 
 from dcc_jax.env.environment import Environment
@@ -19,7 +21,7 @@ from dcc_jax.play.recording import Frame
 Array = jax.Array
 
 
-def episode_key(seed: int | Array, episode: int | Array) -> Array:
+def episode_key(seed: int, episode: Any) -> Array:
     """The key of an episode of a seed."""
     return jax.random.fold_in(jax.random.key(seed), episode)
 
