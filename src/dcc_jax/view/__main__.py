@@ -118,7 +118,6 @@ def _serve(
     finally:
         viewer.close()
         loop.join(2.0)
-        page.stop()
 
 
 if __name__ == "__main__":

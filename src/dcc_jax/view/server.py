@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import io
 import ipaddress
 import socket
 
@@ -42,7 +44,8 @@ def free_port(host: str, port: int) -> int:
 
 def start(host: str, port: int) -> viser.ViserServer:
     """A page without anything on it yet. It says nothing by itself."""
-    return viser.ViserServer(host, port, label="dcc_jax", verbose=False)
+    with contextlib.redirect_stdout(io.StringIO()):
+        return viser.ViserServer(host, port, label="dcc_jax", verbose=False)
 
 
 def is_loopback(host: str) -> bool:

@@ -89,13 +89,19 @@ class Stage:
         add = self._scene
         self._root = add.add_frame(ROOT, show_axes=False)
         if shapes.has_ground(self._model):
+            # The grid is translucent, whatever is behind it; the floor is not.
+            add.add_box(
+                f"{ROOT}/floor",
+                color=(228, 228, 224),
+                dimensions=(60.0, 60.0, 0.02),
+                position=(0.0, 0.0, -0.02),
+                cast_shadow=False,
+            )
             add.add_grid(
                 f"{ROOT}/ground",
                 infinite_grid=True,
                 cell_size=0.5,
                 fade_distance=25.0,
-                plane_color=(232, 232, 228),
-                plane_opacity=1.0,
                 shadow_opacity=0.25,
                 cell_color=(212, 212, 208),
                 section_color=(196, 196, 192),

@@ -77,7 +77,7 @@ class Viewer:
         self._stop = threading.Event()
         self._meter = Meter()
         self.panel = Panel(self, server)
-        server.initial_camera.position = (2.2, -2.6, 1.4)
+        server.initial_camera.position = (1.7, -2.0, 1.3)
         server.initial_camera.look_at = (0.0, 0.0, 0.85)
         server.scene.set_up_direction("+z")
 
