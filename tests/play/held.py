@@ -14,7 +14,6 @@ import numpy as np
 from dcc_jax.config import make_config
 from dcc_jax.env import observation
 from dcc_jax.env.task import Forces, Task
-from dcc_jax.learn.rollout import Policy
 from dcc_jax.play.runs import Run, find_run
 
 HEAVY = 1e7  # kg and kg m^2, added to the pelvis; it adds no weight

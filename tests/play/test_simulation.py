@@ -20,6 +20,7 @@ from dcc_jax.play.simulation import HISTORY, Program, Simulation
 
 HAND = "left_hand"
 FORCE = np.array([20.0, 40.0, -22.36])  # N, 50 N together
+AWAY = np.array([0.0, 0.03, -0.02])  # m, from the hand to the end of the spring
 SETTLING = 150  # control steps, 5 s
 
 
@@ -94,12 +95,10 @@ def test_small_pull_deflects_by_the_inverse_of_the_stiffness(simulation):
     place, k = hand_at(simulation, free), 100.0
     model, scene = simulation.environment.scene.model, simulation.environment.scene
     point = model.body_ipos[model.body(HAND).id]
-    simulation.pull(HAND, point, place + [0.0, 0.03, -0.02], k)
+    simulation.pull(HAND, point, place + AWAY, k)
     moved = hand_at(simulation, settled(simulation))
     force = simulation.pull_force_w
-    np.testing.assert_allclose(
-        force, k * (place + [0.0, 0.03, -0.02] - moved), rtol=0.01, atol=0.01
-    )
+    np.testing.assert_allclose(force, k * (place + AWAY - moved), rtol=0.01, atol=0.01)
     alone = compose_scene(scene.character, floor=False)
     K = stiffness(alone, free, HAND, point, scene.character.kp)
     expected = deflection(K, force)

@@ -1,4 +1,4 @@
-"""A headless Chromium on a page of the viewer. It is the system's own, none is loaded."""
+"""A headless Chromium on a page of the viewer: the one that is installed."""
 
 from __future__ import annotations
 

@@ -16,12 +16,12 @@ from dcc_jax.character import asset_path
 pytest.importorskip("viser")
 pytest.importorskip("selenium")
 
-from selenium.webdriver import ActionChains  # noqa: E402
-from selenium.webdriver.common.keys import Keys  # noqa: E402
+from selenium.webdriver import ActionChains
+from selenium.webdriver.common.keys import Keys
 
-from dcc_jax.view import server  # noqa: E402
-from dcc_jax.view.stage import Grab  # noqa: E402
-from dcc_jax.view.viewer import Viewer  # noqa: E402
+from dcc_jax.view import server
+from dcc_jax.view.stage import Grab
+from dcc_jax.view.viewer import Viewer
 
 pytestmark = [
     pytest.mark.browser,

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("viser")
 
-from dcc_jax.view import server  # noqa: E402
+from dcc_jax.view import server
 
 
 def test_next_free_port_is_taken_where_one_is_in_use():

@@ -17,9 +17,9 @@ from dcc_jax.motion.clip import load_clip
 
 pytest.importorskip("viser")
 
-from dcc_jax.view import __main__ as command  # noqa: E402
-from dcc_jax.view import saving, server, viewer  # noqa: E402
-from dcc_jax.view.plots import CHARTS, data  # noqa: E402
+from dcc_jax.view import __main__ as command
+from dcc_jax.view import saving, server, viewer
+from dcc_jax.view.plots import CHARTS, data
 
 
 def until(happens, seconds: float = 60.0):

@@ -47,14 +47,14 @@ def save(
     if kind == "npz":
         save_clip(path, clip(simulation, moments))
         return path
-    images = film(simulation, moments, alpha)
     if kind == "gif":
-        every = round(CONTROL_RATE / GIF_RATE)
-        some = (image for i, image in enumerate(images) if i % every == 0)
-        small = (pictures.shrunk(image, GIF_WIDTH) for image in some)
+        every, (width, height) = round(CONTROL_RATE / GIF_RATE), SIZE
+        size = 2 * GIF_WIDTH, 2 * GIF_WIDTH * height // width
+        images = film(simulation, moments[::every], alpha, size)
+        small = (pictures.shrunk(image, GIF_WIDTH) for image in images)
         files.write_gif(path, small, GIF_RATE)
     else:
-        files.write_mp4(path, images, CONTROL_RATE)
+        files.write_mp4(path, film(simulation, moments, alpha, SIZE), CONTROL_RATE)
     return path
 
 
@@ -80,7 +80,10 @@ def clip(simulation: Simulation, moments: Sequence[Moment]) -> Clip:
 
 
 def film(
-    simulation: Simulation, moments: Sequence[Moment], alpha: float
+    simulation: Simulation,
+    moments: Sequence[Moment],
+    alpha: float,
+    size: tuple[int, int],
 ) -> Iterator[np.ndarray]:
     """A picture of every moment."""
     motion = jax.tree.map(lambda *rows: np.stack(rows), *[m.motion for m in moments])
@@ -105,5 +108,5 @@ def film(
         ),
         captions=captions,
         view=pictures.view_of(simulation.task),
-        size=SIZE,
+        size=size,
     )
