@@ -12,6 +12,7 @@ import numpy as np
 WIDTH, HEIGHT = 900, 640  # small: the graphics are computed without a card
 PROGRAMS = ("chromium", "chromium-browser", "google-chrome")
 DRIVERS = ("chromedriver", "chromium-driver")
+PATIENCE = 120.0  # s; a machine with other things to do takes its time
 FLAGS = (
     "--headless=new",
     "--no-sandbox",
@@ -54,7 +55,7 @@ def text(window: Any) -> str:
     return window.find_element("tag name", "body").text
 
 
-def until(happens: Callable[[], Any], seconds: float = 60.0) -> Any:
+def until(happens: Callable[[], Any], seconds: float = PATIENCE) -> Any:
     """What `happens` gives as soon as it is true.
 
     Raises:
@@ -67,6 +68,29 @@ def until(happens: Callable[[], Any], seconds: float = 60.0) -> Any:
             return found
         time.sleep(0.1)
     raise AssertionError(f"in {seconds:g} s it did not happen")
+
+
+def mouse(window: Any, kind: str, x: int, y: int, held: bool = True) -> None:
+    """What the left button or the mouse does; again where the page is too slow."""
+    from selenium.common.exceptions import TimeoutException
+
+    event = {
+        "type": kind,
+        "x": x,
+        "y": y,
+        "button": "left" if held else "none",
+        "buttons": int(held and kind != "mouseReleased"),
+        "clickCount": int(kind != "mouseMoved"),
+    }
+
+    def sent() -> bool:
+        try:
+            window.execute_cdp_cmd("Input.dispatchMouseEvent", event)
+        except TimeoutException:
+            return False
+        return True
+
+    until(sent)
 
 
 def pixel(window: Any, client: Any, place: np.ndarray) -> tuple[int, int]:

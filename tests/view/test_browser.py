@@ -16,7 +16,6 @@ from dcc_jax.character import asset_path
 pytest.importorskip("viser")
 pytest.importorskip("selenium")
 
-from selenium.webdriver import ActionChains
 from selenium.webdriver.common.keys import Keys
 
 from dcc_jax.view import server
@@ -43,6 +42,9 @@ def viewer(second_policy: str, tmp_path_factory: pytest.TempPathFactory):
     page = server.start("127.0.0.1", server.free_port("127.0.0.1", 8500))
     out = tmp_path_factory.mktemp("saved")
     viewer = Viewer(page, "push", ("push", second_policy), out=out)
+    # Graphics without a card share the cores with the physics.
+    viewer.set_plain(True)
+    viewer.panel.speed.value = 0.5
     loop = threading.Thread(target=viewer.run, daemon=True)
     loop.start()
     yield viewer
@@ -108,11 +110,10 @@ def test_hand_dragged_with_the_mouse_pulls_and_u_answers(window, viewer, simulat
     middle = model.geom_pos[model.body_geomadr[hand]]  # not the wrist
     place = stage.place_w(Grab("left_hand", middle, np.zeros(3))) - stage.offset
     x, y = browser.pixel(window, client, place)
-    mouse = ActionChains(window, duration=50)
-    mouse.w3c_actions.pointer_action.move_to_location(x, y).pointer_down()
+    browser.mouse(window, "mouseMoved", x, y, held=False)
+    browser.mouse(window, "mousePressed", x, y)
     for step in range(1, 4):
-        mouse.w3c_actions.pointer_action.move_to_location(x + 20 * step, y - 10 * step)
-    mouse.perform()
+        browser.mouse(window, "mouseMoved", x + 20 * step, y - 10 * step)
     grab = browser.until(lambda: viewer._grab)
     assert grab.body in ("left_hand", "left_forearm")
     viewer.panel.paused.value = False
@@ -121,9 +122,7 @@ def test_hand_dragged_with_the_mouse_pulls_and_u_answers(window, viewer, simulat
     kept(window, "view-pull")
     force = np.linalg.norm(simulation.pull_force_w)
     assert 5.0 < force < 200.0
-    mouse = ActionChains(window)
-    mouse.w3c_actions.pointer_action.pointer_up()
-    mouse.perform()
+    browser.mouse(window, "mouseReleased", x + 60, y - 30)
     browser.until(lambda: viewer._grab is None)
     browser.until(lambda: np.linalg.norm(simulation.pull_force_w) == 0.0)
 
@@ -149,14 +148,16 @@ def test_reset_begins_the_next_episode(window, viewer, simulation):
 def test_film_and_clip_are_saved(window, viewer, simulation, kind):
     browser.until(lambda: len(simulation.history) > 60)
     browser.press(window, kind)
-    browser.until(lambda: list(viewer.out.glob(f"*{kind[4:].strip()}")), 300.0)
+    browser.until(lambda: list(viewer.out.glob(f"*{kind[4:].strip()}")), COMPILING)
     browser.until(lambda: "saved" in browser.text(window))
 
 
 def test_policy_is_changed_on_the_page(window, viewer, simulation, second_policy):
     box = browser.field(window, "Policy")
-    window.execute_script("arguments[0].click()", box)
-    box.send_keys(Keys.ARROW_DOWN, Keys.ENTER)
+    window.execute_script("arguments[0].focus(); arguments[0].click()", box)
+    option = f"//*[@role='option'][normalize-space()='{second_policy}']"
+    browser.until(lambda: window.find_elements("xpath", option))
+    window.execute_script("arguments[0].click()", window.find_element("xpath", option))
     browser.until(lambda: viewer.name == second_policy)
     browser.until(lambda: viewer.simulation is not simulation)
     assert viewer.simulation.program is simulation.program

@@ -120,7 +120,7 @@ def test_physics_that_breaks_is_said_and_the_loop_goes_on(live):
 
 def test_error_of_a_control_is_a_line_on_the_page(live):
     live.ask(lambda simulation: simulation.act("fly"))
-    until(lambda: "'fly'" in live.panel.status.content)
+    until(lambda: "&#x27;fly&#x27;" in live.panel.status.content)
     before = live.simulation._count
     until(lambda: live.simulation._count > before)
 

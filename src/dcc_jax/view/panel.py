@@ -32,7 +32,8 @@ class Panel:
         self._own: list[Any] = []  # what belongs to the policy of the moment
         server.gui.configure_theme(control_layout="fixed", show_logo=False)
         server.gui.set_panel_label("dcc_jax")
-        self.status = server.gui.add_markdown("starting ...")
+        # Text that is set four times a second: markdown would be compiled every time.
+        self.status = server.gui.add_html("starting ...")
         self._add_policy()
         self._add_compliance()
         self._add_pull()
@@ -122,6 +123,8 @@ class Panel:
                 box.on_update(
                     lambda event, name=name, box=box: setattr(looks, name, box.value)
                 )
+            plain = self._gui.add_checkbox("plain: fast without a graphics card", False)
+            plain.on_update(lambda event: self._viewer.set_plain(plain.value))
 
     def _add_saving(self) -> None:
         with self._gui.add_folder("Save the last ten seconds"):

@@ -46,6 +46,25 @@ def has_ground(model: mujoco.MjModel) -> bool:
     return bool((model.geom_type == GEOM.mjGEOM_PLANE).any())
 
 
+def tiles(count: int, parity: int) -> tuple[np.ndarray, np.ndarray]:
+    """Every other tile of 1 m of a floor with `count` along an edge, around zero."""
+    edge = np.arange(count) - count // 2
+    corners = np.stack(np.meshgrid(edge, edge, indexing="ij"), axis=-1).reshape(-1, 2)
+    corners = corners[corners.sum(axis=1) % 2 == parity]
+    square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    vertices = (corners[:, None] + square).reshape(-1, 2)
+    first = 4 * np.arange(len(corners))[:, None, None]
+    faces = (first + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
+    return np.pad(vertices.astype(float), ((0, 0), (0, 1))), faces
+
+
+def grid(count: int) -> np.ndarray:
+    """Ends [L, 2, 3] of lines 1 m apart, with `count` squares along an edge."""
+    at, half = np.arange(count + 1.0) - count // 2, count / 2
+    ends = np.stack(np.broadcast_arrays(at[:, None], [[-half, half]], 0.0), axis=-1)
+    return np.concatenate([ends, ends[..., [1, 0, 2]]]).astype(np.float32)
+
+
 def sphere(radius: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """Vertices [V, 3] and faces [F, 3] of a ball."""
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=radius)

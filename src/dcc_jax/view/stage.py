@@ -26,6 +26,9 @@ from dcc_jax.view import shapes
 ROOT = "/world"
 BLUE, ORANGE, GREEN = (90, 190, 240), (242, 89, 15), (60, 170, 90)
 GHOST_OPACITY = 0.3
+FLOOR = 30  # tiles of 1 m along an edge of the floor that is drawn
+LINES = (190, 190, 186)
+FLOOR_COLOURS = (236, 236, 232), (214, 215, 213)
 NEWTONS_A_METRE = 250.0  # of an arrow
 LONGEST_ARROW = 1.2  # m
 ECHO = 6  # control steps in which an arrow fades: a ball touches for one or two
@@ -45,6 +48,8 @@ class Looks:
     ghost: bool = True
     arrows: bool = True
     shells: bool = True
+    plain: bool = False
+    """Lines in place of a floor, no shadows: fast where there is no graphics card."""
 
 
 @dataclass(frozen=True)
@@ -88,24 +93,28 @@ class Stage:
     def _build(self) -> None:
         add = self._scene
         self._root = add.add_frame(ROOT, show_axes=False)
+        self._middle = np.zeros(3)
+        self._tiles: list[viser.MeshHandle] = []
+        self._lines: list[viser.LineSegmentsHandle] = []
         if shapes.has_ground(self._model):
-            # The grid is translucent, whatever is behind it; the floor is not.
-            add.add_box(
-                f"{ROOT}/floor",
-                color=(228, 228, 224),
-                dimensions=(60.0, 60.0, 0.02),
-                position=(0.0, 0.0, -0.02),
-                cast_shadow=False,
+            self._lines.append(
+                add.add_line_segments(
+                    f"{ROOT}/lines",
+                    shapes.grid(FLOOR),
+                    LINES,
+                    thickness=1.0,
+                    thickness_units="screen",
+                )
             )
-            add.add_grid(
-                f"{ROOT}/ground",
-                infinite_grid=True,
-                cell_size=0.5,
-                fade_distance=25.0,
-                shadow_opacity=0.25,
-                cell_color=(212, 212, 208),
-                section_color=(196, 196, 192),
-            )
+            self._tiles = [
+                add.add_mesh_simple(
+                    f"{ROOT}/floor/{i}",
+                    *shapes.tiles(FLOOR, parity=i),
+                    color=colour,
+                    cast_shadow=False,
+                )
+                for i, colour in enumerate(FLOOR_COLOURS)
+            ]
         found = shapes.shapes(self._model)
         self._bodies = [(s.body, self._shape(i, s)) for i, s in enumerate(found)]
         own = self._model.body_rootid == self._model.dof_bodyid[self._dof_adr]
@@ -197,6 +206,16 @@ class Stage:
             self._show_arrows(moments if looks.arrows else [])
             self._show_grab(grab, motion, looks.shells, alpha)
 
+    def set_plain(self, plain: bool) -> None:
+        """With or without floor, shadows and reflections."""
+        with self._server.atomic():
+            for tiles in self._tiles:
+                tiles.visible = not plain
+            for lines in self._lines:
+                lines.visible = plain
+            self._scene.configure_default_lights(cast_shadow=not plain)
+            self._scene.configure_environment_map(None if plain else "city")
+
     def still(self, qpos: np.ndarray) -> None:
         """Shows a pose [nq] and nothing else, while there is no motion yet."""
         self._data.qpos[:] = qpos
@@ -236,6 +255,12 @@ class Stage:
             share = FOLLOW if np.linalg.norm(away) < 1.0 else 1.0
             self.offset = self.offset + share * away
         self._root.position = -self.offset
+        # The floor has no end: it goes along by whole pairs of tiles.
+        middle = 2.0 * np.round(0.5 * root)
+        if np.any(middle != self._middle):
+            self._middle = middle
+            for floor in (*self._tiles, *self._lines):
+                floor.position = middle
 
     def _show_ghost(self, qpos: np.ndarray | None, motion: Motion) -> None:
         if qpos is not None:

@@ -6,6 +6,7 @@ compiled in a thread of their own while the page shows the scene.
 
 from __future__ import annotations
 
+import html
 import queue
 import threading
 import time
@@ -27,7 +28,7 @@ Ask = Callable[[Simulation], None]
 
 PERIOD = 1.0 / CONTROL_RATE
 STATUS_EVERY = 0.25  # s
-PLOTS_EVERY = 0.5  # s
+PLOTS_EVERY = 1.0  # s
 KEEPS_UP = 0.95  # share of the speed asked for below which it does not keep up
 LATE = 0.25  # s behind, from which on time that is lost is not made up for
 PROGRAMS = 3  # that are kept: going back to a skill is then immediate
@@ -128,6 +129,11 @@ class Viewer:
         if self._grab is not None:
             self._pull(self._grab)
 
+    def set_plain(self, plain: bool) -> None:
+        """See `Looks.plain`."""
+        self.looks.plain = plain
+        self._queue.put(lambda: self._stage and self._stage.set_plain(plain))
+
     @property
     def alpha_now(self) -> float:
         """The level that acts."""
@@ -181,7 +187,7 @@ class Viewer:
             work()
         except Exception as error:
             reason = (str(error).splitlines() or [type(error).__name__])[0]
-            self.note = f"**{reason[:200]}**"
+            self.note = bold(reason[:200])
 
     def _step(self) -> None:
         simulation, stage = self.simulation, self._stage
@@ -272,6 +278,7 @@ class Viewer:
     def _set_stage(self, began: tuple[str, float], program: Program) -> None:
         if began is self._loading:
             self._stage = Stage(self.server, program.environment, self._dragged)
+            self._stage.set_plain(self.looks.plain)
             self._stage.still(program.first_qpos)
             self.simulation = None
 
@@ -307,25 +314,26 @@ class Viewer:
         if self._loading is not None:
             name, since = self._loading
             waited = time.perf_counter() - since
-            lines.append(f"compiling **{name}**: {waited:.0f} s; it moves when done")
+            lines.append(f"compiling {bold(name)}: {waited:.0f} s; it moves when done")
         elif self.simulation is not None:
             lines += self._numbers(self.simulation)
-        return "  \n".join(lines)
+        return "<br>".join(lines)
 
     def _numbers(self, simulation: Simulation) -> list[str]:
         if not simulation.history:
             return []
         numbers = simulation.history[-1].numbers
+        force = f"{numbers['force_peak']:.0f} N"
+        turned = f"{np.degrees(numbers['displacement']):.1f} deg"
+        away = f"{100 * numbers['root_displacement']:.1f} cm"
         wanted = self.panel.speed.value
         speed = f"{self.real_time_factor:.2f} x real time"
         if self.panel.paused.value:
             speed = "paused"
         elif self.real_time_factor < KEEPS_UP * wanted:
-            speed = f"🔴 **cannot keep up: {speed}**"
+            speed = "🔴 " + bold(f"cannot keep up: {speed}")
         return [
-            f"force **{numbers['force_peak']:.0f} N**, u "
-            f"**{np.degrees(numbers['displacement']):.1f} deg**, "
-            f"**{100 * numbers['root_displacement']:.1f} cm**",
+            f"force {bold(force)}, u {bold(turned)}, {bold(away)}",
             f"{speed}, a control step takes {1e3 * simulation.step_seconds:.0f} ms",
             f"{simulation.falls} falls, none for {simulation.seconds_since_fall:.0f} s",
         ]
@@ -335,11 +343,16 @@ class Viewer:
     ) -> None:
         try:
             path = saving.save(simulation, moments, kind, alpha, self.out)
-            self.note = f"saved {path}"
+            self.note = html.escape(f"saved {path}")
             self.server.send_file_download(path.name, path.read_bytes())
         except Exception as error:
             reason = (str(error).splitlines() or [type(error).__name__])[0]
-            self.note = f"**not saved: {reason[:200]}**"
+            self.note = bold(f"not saved: {reason[:200]}")
+
+
+def bold(text: str) -> str:
+    """For the page; whatever the text holds is shown as it is."""
+    return f"<b>{html.escape(text)}</b>"
 
 
 class Meter:
