@@ -10,10 +10,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from still import Still
 
 from dcc_jax.character import asset_path
 from dcc_jax.motion.clip import load_clip
+from still import Still
 
 pytest.importorskip("viser")
 
