@@ -6,9 +6,9 @@ import jax
 import numpy as np
 
 from dcc_jax.play import pull, stepping
+from dcc_jax.play.program import Program
 from dcc_jax.play.recording import Frame, Motion
 from dcc_jax.play.runs import Run
-from dcc_jax.play.simulation import Program
 
 NUMBERS = (
     "force_peak",

@@ -104,7 +104,7 @@ def stood_in(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, result in results.items():
         real = getattr(dcc_jax, name)
         monkeypatch.setattr(dcc_jax, name, checked(real, result))
-    monkeypatch.setattr("dcc_jax.play.simulation.Program", Still)
+    monkeypatch.setattr("dcc_jax.play.program.Program", Still)
 
 
 def emptied(kind: type) -> dict[str, Any]:

@@ -15,8 +15,9 @@ from dcc_jax.control.stiffness import deflection, stiffness
 from dcc_jax.play import player as player_module
 from dcc_jax.play import pull
 from dcc_jax.play.player import Player
+from dcc_jax.play.program import Program
 from dcc_jax.play.runs import find_run, make_environment
-from dcc_jax.play.simulation import HISTORY, Program, Simulation
+from dcc_jax.play.simulation import HISTORY, Simulation
 
 HAND = "left_hand"
 FORCE = np.array([20.0, 40.0, -22.36])  # N, 50 N together

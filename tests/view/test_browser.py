@@ -19,7 +19,7 @@ pytest.importorskip("selenium")
 from selenium.webdriver.common.keys import Keys
 
 from dcc_jax.view import server
-from dcc_jax.view.stage import Grab
+from dcc_jax.view.grip import Grab
 from dcc_jax.view.viewer import Viewer
 
 pytestmark = [

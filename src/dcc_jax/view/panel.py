@@ -13,7 +13,8 @@ import viser
 
 from dcc_jax.character import BODIES
 from dcc_jax.play import actions
-from dcc_jax.play.simulation import Program, Simulation
+from dcc_jax.play.program import Program
+from dcc_jax.play.simulation import Simulation
 from dcc_jax.view.plots import Plots
 
 if TYPE_CHECKING:

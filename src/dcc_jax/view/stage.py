@@ -1,4 +1,4 @@
-"""What is seen: the scene, the ghost, forces, the rope, the ellipsoids of stiffness.
+"""What is seen: the bodies, the ghost, the forces, and what somebody holds.
 
 Everything hangs on one node. It moves against the character's root where the camera
 follows: so the mouse keeps turning the camera, and a browser its own one.
@@ -7,7 +7,6 @@ Letters: F forces.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,25 +15,20 @@ import mujoco
 import numpy as np
 import viser
 
-from dcc_jax.character import compose_scene
-from dcc_jax.control.stiffness import ellipsoid, modulated_stiffness, stiffness
 from dcc_jax.env.environment import Environment
 from dcc_jax.play.recording import Motion
 from dcc_jax.play.simulation import Moment
 from dcc_jax.view import shapes
+from dcc_jax.view.floor import Floor
+from dcc_jax.view.grip import BLUE, Grab, Grip, place_w
 
 ROOT = "/world"
-BLUE, ORANGE, GREEN = (90, 190, 240), (242, 89, 15), (60, 170, 90)
+ORANGE = (242, 89, 15)
 GHOST_OPACITY = 0.3
-FLOOR = 30  # tiles of 1 m along an edge of the floor that is drawn
-LINES = (190, 190, 186)
-FLOOR_COLOURS = (236, 236, 232), (214, 215, 213)
 NEWTONS_A_METRE = 250.0  # of an arrow
 LONGEST_ARROW = 1.2  # m
 ECHO = 6  # control steps in which an arrow fades: a ball touches for one or two
 FOLLOW = 0.15  # share of the way to the root that the camera goes in a control step
-SHELL_FORCE = 50.0  # N; the ellipsoids are where it takes the point
-SHELL_LIMIT = 0.5  # m, of an ellipsoid's axis
 APART = 0.005  # m, below which the ghost is not shown
 
 DragHandler = Callable[[str, Any], None]
@@ -50,15 +44,6 @@ class Looks:
     shells: bool = True
     plain: bool = False
     """Lines in place of a floor, no shadows: fast where there is no graphics card."""
-
-
-@dataclass(frozen=True)
-class Grab:
-    """A point of a body that somebody holds."""
-
-    body: str
-    point: np.ndarray  # [3] m, in the body's frame
-    target: np.ndarray  # [3] m, of the page: it stays under the mouse
 
 
 class Stage:
@@ -82,7 +67,6 @@ class Stage:
         self._model = environment.scene.model
         self._data = mujoco.MjData(self._model)
         self._shadow = mujoco.MjData(self._model)
-        self._alone = compose_scene(environment.scene.character, floor=False)
         self._on_drag = on_drag
         self.offset = np.zeros(3)
         """m [3]: a point of the world is on the page at its place less the offset."""
@@ -93,28 +77,8 @@ class Stage:
     def _build(self) -> None:
         add = self._scene
         self._root = add.add_frame(ROOT, show_axes=False)
-        self._middle = np.zeros(3)
-        self._tiles: list[viser.MeshHandle] = []
-        self._lines: list[viser.LineSegmentsHandle] = []
-        if shapes.has_ground(self._model):
-            self._lines.append(
-                add.add_line_segments(
-                    f"{ROOT}/lines",
-                    shapes.grid(FLOOR),
-                    LINES,
-                    thickness=1.0,
-                    thickness_units="screen",
-                )
-            )
-            self._tiles = [
-                add.add_mesh_simple(
-                    f"{ROOT}/floor/{i}",
-                    *shapes.tiles(FLOOR, parity=i),
-                    color=colour,
-                    cast_shadow=False,
-                )
-                for i, colour in enumerate(FLOOR_COLOURS)
-            ]
+        ground = shapes.has_ground(self._model)
+        self._floor = Floor(self._scene, ROOT) if ground else None
         found = shapes.shapes(self._model)
         self._bodies = [(s.body, self._shape(i, s)) for i, s in enumerate(found)]
         own = self._model.body_rootid == self._model.dof_bodyid[self._dof_adr]
@@ -123,21 +87,7 @@ class Stage:
         ]
         nowhere = np.zeros((1, 2, 3), np.float32)
         self._arrows = add.add_arrows(f"{ROOT}/forces", nowhere, ORANGE, visible=False)
-        self._rope = add.add_line_segments(
-            f"{ROOT}/rope", nowhere, GREEN, thickness=0.012, visible=False
-        )
-        self._label = add.add_label(f"{ROOT}/pull", "", visible=False)
-        self._shells = [
-            add.add_mesh_simple(
-                f"{ROOT}/{name}",
-                *shapes.sphere(),
-                color=colour,
-                opacity=0.35,
-                cast_shadow=False,
-                visible=False,
-            )
-            for name, colour in (("K", GREEN), ("K_hat", BLUE))
-        ]
+        self._grip = Grip(self._scene, ROOT, self._environment)
 
     @property
     def _dof_adr(self) -> int:
@@ -204,15 +154,15 @@ class Stage:
                 handle.wxyz = self._data.xquat[body]
             self._show_ghost(ghost_qpos if looks.ghost else None, motion)
             self._show_arrows(moments if looks.arrows else [])
-            self._show_grab(grab, motion, looks.shells, alpha)
+            self._grip.show(
+                self._data, grab, self.offset, motion, alpha if looks.shells else None
+            )
 
     def set_plain(self, plain: bool) -> None:
         """With or without floor, shadows and reflections."""
         with self._server.atomic():
-            for tiles in self._tiles:
-                tiles.visible = not plain
-            for lines in self._lines:
-                lines.visible = plain
+            if self._floor is not None:
+                self._floor.set_plain(plain)
             self._scene.configure_default_lights(cast_shadow=not plain)
             self._scene.configure_environment_map(None if plain else "city")
 
@@ -242,9 +192,7 @@ class Stage:
 
     def place_w(self, grab: Grab) -> np.ndarray:
         """Where a held point is, [3] m, world."""
-        index = self._model.body(grab.body).id
-        turn = self._data.xmat[index].reshape(3, 3)
-        return self._data.xpos[index] + turn @ grab.point
+        return place_w(self._data, grab)
 
     def _follow(self, follow: bool) -> None:
         adr = self._environment.scene.qpos_adr
@@ -255,12 +203,8 @@ class Stage:
             share = FOLLOW if np.linalg.norm(away) < 1.0 else 1.0
             self.offset = self.offset + share * away
         self._root.position = -self.offset
-        # The floor has no end: it goes along by whole pairs of tiles.
-        middle = 2.0 * np.round(0.5 * root)
-        if np.any(middle != self._middle):
-            self._middle = middle
-            for floor in (*self._tiles, *self._lines):
-                floor.position = middle
+        if self._floor is not None:
+            self._floor.follow(root)
 
     def _show_ghost(self, qpos: np.ndarray | None, motion: Motion) -> None:
         if qpos is not None:
@@ -277,51 +221,6 @@ class Stage:
         _set_visible(self._arrows, len(lines) > 0)
         if len(lines):
             self._arrows.points = lines
-
-    def _show_grab(
-        self, grab: Grab | None, motion: Motion, shells: bool, alpha: float
-    ) -> None:
-        for handle in (self._rope, self._label):
-            _set_visible(handle, grab is not None)
-        for handle in self._shells:
-            _set_visible(handle, grab is not None and shells)
-        if grab is None:
-            return
-        place = self.place_w(grab)
-        end = grab.target + self.offset
-        self._rope.points = np.array([[place, end]], np.float32)
-        self._label.position = end
-        force = np.linalg.norm(np.asarray(motion.force_w)[-2])
-        if force > 0.0:
-            self._label.text = f"{force:.0f} N"
-        if shells:
-            self._show_shells(grab, place, alpha)
-
-    def _show_shells(self, grab: Grab, place: np.ndarray, alpha: float) -> None:
-        K = self.stiffness(grab)
-        for handle, matrix in zip(
-            self._shells,
-            (K, K if K is None else modulated_stiffness(K, min(alpha, 0.99))),
-            strict=True,
-        ):
-            _set_visible(handle, matrix is not None)
-            if matrix is not None:
-                axes, along = ellipsoid(matrix)
-                turn = np.empty(4)
-                mujoco.mju_mat2Quat(turn, axes.flatten())
-                handle.position, handle.wxyz = place, turn
-                radii = np.clip(SHELL_FORCE / along, 0.004, SHELL_LIMIT)
-                x, y, z = (float(radius) for radius in radii)
-                handle.scale = x, y, z
-
-    def stiffness(self, grab: Grab) -> np.ndarray | None:
-        """K [3, 3] N/m of the grabbed point, Eq. (4); None where no joint moves it."""
-        character = self._environment.scene.character
-        if grab.body not in character.body_names[1:]:
-            return None
-        adr = self._environment.scene.qpos_adr
-        qpos = self._data.qpos[adr : adr + character.nq]
-        return stiffness(self._alone, qpos, grab.body, grab.point, character.kp)
 
 
 def arrows(moments: Sequence[Moment]) -> np.ndarray:
@@ -365,8 +264,3 @@ def _set_visible(handle: Any, visible: bool) -> None:
 def _rgb(rgba: Sequence[float]) -> tuple[int, int, int]:
     red, green, blue = (round(255 * x) for x in rgba[:3])
     return red, green, blue
-
-
-def moved(grab: Grab, target: np.ndarray) -> Grab:
-    """The same point, pulled elsewhere."""
-    return dataclasses.replace(grab, target=np.asarray(target, float))

@@ -6,7 +6,6 @@ compiled in a thread of their own while the page shows the scene.
 
 from __future__ import annotations
 
-import html
 import queue
 import threading
 import time
@@ -18,18 +17,19 @@ import numpy as np
 import viser
 
 from dcc_jax.env.config import CONTROL_RATE
+from dcc_jax.play.program import Program
 from dcc_jax.play.runs import find_run
-from dcc_jax.play.simulation import Program, Simulation
-from dcc_jax.view import saving
+from dcc_jax.play.simulation import Simulation
+from dcc_jax.view import saving, status
+from dcc_jax.view.grip import Grab, moved
 from dcc_jax.view.panel import Panel
-from dcc_jax.view.stage import ECHO, Grab, Looks, Stage, moved
+from dcc_jax.view.stage import ECHO, Looks, Stage
 
 Ask = Callable[[Simulation], None]
 
 PERIOD = 1.0 / CONTROL_RATE
 STATUS_EVERY = 0.25  # s
 PLOTS_EVERY = 1.0  # s
-KEEPS_UP = 0.95  # share of the speed asked for below which it does not keep up
 LATE = 0.25  # s behind, from which on time that is lost is not made up for
 PROGRAMS = 3  # that are kept: going back to a skill is then immediate
 LARGEST_FORCE = 1000.0  # N, that a mouse can pull with
@@ -76,7 +76,7 @@ class Viewer:
         self._single = False
         self._loading: tuple[str, float] | None = None
         self._stop = threading.Event()
-        self._meter = Meter()
+        self._meter = status.Meter()
         self.panel = Panel(self, server)
         server.initial_camera.position = (1.7, -2.0, 1.3)
         server.initial_camera.look_at = (0.0, 0.0, 0.85)
@@ -187,7 +187,7 @@ class Viewer:
             work()
         except Exception as error:
             reason = (str(error).splitlines() or [type(error).__name__])[0]
-            self.note = bold(reason[:200])
+            self.note = status.bold(reason[:200])
 
     def _step(self) -> None:
         simulation, stage = self.simulation, self._stage
@@ -298,7 +298,7 @@ class Viewer:
         self.name, self.simulation, self._loading = began[0], simulation, None
         while len(self._programs) > PROGRAMS:
             self._programs.pop(next(iter(self._programs)))
-        self._meter = Meter()
+        self._meter = status.Meter()
         self.panel.policy.value = self.name
         self.panel.of_policy(simulation)
 
@@ -307,68 +307,26 @@ class Viewer:
             self.panel.plots.show(self.simulation.history)
 
     def _show_status(self) -> None:
-        self.panel.status.content = self._status()
+        self.panel.status.content = self.status_text()
 
-    def _status(self) -> str:
-        lines = [self.note] if self.note else []
+    def status_text(self) -> str:
+        """What the page says at its top."""
+        loading = None
         if self._loading is not None:
             name, since = self._loading
-            waited = time.perf_counter() - since
-            lines.append(f"compiling {bold(name)}: {waited:.0f} s; it moves when done")
-        elif self.simulation is not None:
-            lines += self._numbers(self.simulation)
-        return "<br>".join(lines)
-
-    def _numbers(self, simulation: Simulation) -> list[str]:
-        if not simulation.history:
-            return []
-        numbers = simulation.history[-1].numbers
-        force = f"{numbers['force_peak']:.0f} N"
-        turned = f"{np.degrees(numbers['displacement']):.1f} deg"
-        away = f"{100 * numbers['root_displacement']:.1f} cm"
-        wanted = self.panel.speed.value
-        speed = f"{self.real_time_factor:.2f} x real time"
-        if self.panel.paused.value:
-            speed = "paused"
-        elif self.real_time_factor < KEEPS_UP * wanted:
-            speed = "🔴 " + bold(f"cannot keep up: {speed}")
-        return [
-            f"force {bold(force)}, u {bold(turned)}, {bold(away)}",
-            f"{speed}, a control step takes {1e3 * simulation.step_seconds:.0f} ms",
-            f"{simulation.falls} falls, none for {simulation.seconds_since_fall:.0f} s",
-        ]
+            loading = name, time.perf_counter() - since
+        wanted = 0.0 if self.panel.paused.value else float(self.panel.speed.value)
+        return status.text(
+            self.note, loading, self.simulation, self.real_time_factor, wanted
+        )
 
     def _save(
         self, simulation: Simulation, moments: list, kind: str, alpha: float
     ) -> None:
         try:
             path = saving.save(simulation, moments, kind, alpha, self.out)
-            self.note = html.escape(f"saved {path}")
+            self.note = status.plain(f"saved {path}")
             self.server.send_file_download(path.name, path.read_bytes())
         except Exception as error:
             reason = (str(error).splitlines() or [type(error).__name__])[0]
-            self.note = bold(f"not saved: {reason[:200]}")
-
-
-def bold(text: str) -> str:
-    """For the page; whatever the text holds is shown as it is."""
-    return f"<b>{html.escape(text)}</b>"
-
-
-class Meter:
-    """How fast the simulated time goes against the clock, over the last two seconds."""
-
-    def __init__(self) -> None:
-        self._counted = 0.0
-        self._marks = [(time.perf_counter(), 0.0)]
-
-    def count(self, seconds: float) -> None:
-        """So much was simulated."""
-        self._counted += seconds
-
-    def factor(self, now: float) -> float:
-        """Simulated seconds a second."""
-        self._marks = [m for m in self._marks if now - m[0] < 2.0] or self._marks[-1:]
-        since, counted = self._marks[0]
-        self._marks.append((now, self._counted))
-        return (self._counted - counted) / max(now - since, 1e-3)
+            self.note = status.bold(f"not saved: {reason[:200]}")
