@@ -5,8 +5,8 @@ Callbacks come from viser's threads; they only put work into the viewer's queue.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
 
 import numpy as np
 import viser
@@ -16,19 +16,34 @@ from dcc_jax.play import actions
 from dcc_jax.play.program import Program
 from dcc_jax.play.simulation import Simulation
 from dcc_jax.view.plots import Plots
-
-if TYPE_CHECKING:
-    from dcc_jax.view.viewer import Viewer
+from dcc_jax.view.stage import Looks
 
 SPRINGS = (50, 2000, 50, 400)  # N/m: least, greatest, step, at first
 STRENGTHS = (0, 300, 5, 60)  # N of a push
 FREE_ALPHA = 0.9  # greatest alpha offered where the policy knows one alone
 
 
+class Owner(Protocol):
+    """What carries out what the controls ask for."""
+
+    name: str
+    known: tuple[str, ...]
+    seed: int
+    looks: Looks
+
+    def ask(self, work: Callable[[Simulation], None]) -> None: ...
+    def load(self, name: str, task: Mapping[str, Any] | None = None) -> None: ...
+    def save(self, kind: str) -> None: ...
+    def restart(self, seed: int | None = None) -> None: ...
+    def one_step(self) -> None: ...
+    def restring(self) -> None: ...
+    def set_plain(self, plain: bool) -> None: ...
+
+
 class Panel:
     """Everything beside the scene."""
 
-    def __init__(self, viewer: Viewer, server: viser.ViserServer) -> None:
+    def __init__(self, viewer: Owner, server: viser.ViserServer) -> None:
         self._viewer, self._gui = viewer, server.gui
         self._own: list[Any] = []  # what belongs to the policy of the moment
         server.gui.configure_theme(control_layout="fixed", show_logo=False)

@@ -28,7 +28,7 @@ class Shape:
 
 def shapes(model: mujoco.MjModel) -> list[Shape]:
     """The shapes of all bodies, the ground plane aside."""
-    found: dict[tuple, list[trimesh.Trimesh]] = {}
+    found: dict[tuple, list[Any]] = {}
     for geom in range(model.ngeom):
         mesh = None if _hidden(model, geom) else _mesh(model, geom)
         if mesh is not None:
@@ -75,7 +75,7 @@ def _hidden(model: mujoco.MjModel, geom: int) -> bool:
     return model.geom_group[geom] > VISIBLE_GROUPS or model.geom_rgba[geom, 3] == 0.0
 
 
-def _mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
+def _mesh(model: mujoco.MjModel, geom: int) -> Any:
     """In the geom's frame; None of a plane and what else has no shape."""
     kind, size = int(model.geom_type[geom]), model.geom_size[geom]
     make: Any = trimesh.creation
@@ -104,6 +104,6 @@ def _stored(model: mujoco.MjModel, mesh: int) -> trimesh.Trimesh:
     )
 
 
-def _joined(body: int, rgba: tuple, meshes: list[trimesh.Trimesh]) -> Shape:
+def _joined(body: int, rgba: tuple, meshes: list[Any]) -> Shape:
     mesh: Any = trimesh.util.concatenate(meshes)
     return Shape(body, rgba, np.asarray(mesh.vertices), np.asarray(mesh.faces))
