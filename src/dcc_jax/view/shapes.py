@@ -28,7 +28,7 @@ class Shape:
 
 def shapes(model: mujoco.MjModel) -> list[Shape]:
     """The shapes of all bodies, the ground plane aside."""
-    found: dict[tuple, list[Any]] = {}
+    found: dict[tuple[int, tuple], list[Any]] = {}
     for geom in range(model.ngeom):
         mesh = None if _hidden(model, geom) else _mesh(model, geom)
         if mesh is not None:
@@ -38,7 +38,7 @@ def shapes(model: mujoco.MjModel) -> list[Shape]:
             mesh.apply_transform(place)
             colour = tuple(float(x) for x in model.geom_rgba[geom])
             found.setdefault((int(model.geom_bodyid[geom]), colour), []).append(mesh)
-    return [_joined(*key, meshes) for key, meshes in found.items()]
+    return [_joined(body, rgba, meshes) for (body, rgba), meshes in found.items()]
 
 
 def has_ground(model: mujoco.MjModel) -> bool:
