@@ -21,7 +21,7 @@ LEVELS := --env.alpha 0 --env.alpha-max 0.04
 # Tests that share a compiled program run on one worker (tests/conftest.py).
 WORKERS := -n auto --dist loadgroup --no-loadscope-reorder
 
-.PHONY: setup run test test-all check clean
+.PHONY: setup view run test test-browser test-all check clean
 
 setup: $(STAMP)
 
@@ -29,20 +29,31 @@ $(STAMP): pyproject.toml $(CONSTRAINTS)
 	$(if $(VERSION),,$(error PYTHON=$(PYTHON) is no Python interpreter))
 	$(PYTHON) -m venv $(FRESH) $(VENV)
 	$(BIN)/pip install --quiet --upgrade pip
-	$(BIN)/pip install --quiet -c $(CONSTRAINTS) -e ".[dev,video]"
+	$(BIN)/pip install --quiet -c $(CONSTRAINTS) -e ".[dev,video,view]"
 	touch $(STAMP)
+
+# Another policy: `make view POLICY=door`, or a run directory.
+POLICY ?= push
+view: setup
+	$(BIN)/python -m dcc_jax.view $(POLICY)
 
 run: setup
 	$(BIN)/python -m dcc_jax.train --task trampoline $(LEVELS) --train.total-tuples $(TUPLES) --run-dir $(RUN)
 	$(BIN)/python -m dcc_jax.render $(RUN) --seconds 12 --out $(RUN)/policy.mp4
 	@echo "curves: $(RUN)/curves.png   video: $(RUN)/policy.mp4   go on: \
 	$(BIN)/python -m dcc_jax.train --task trampoline $(LEVELS) --resume --run-dir $(RUN)"
+	@echo "pull what was learned, in a browser:   make view POLICY=$(RUN)"
 
 test: setup
 	$(BIN)/python -m pytest $(WORKERS)
 
+# The viewer in a Chromium that is installed; its pictures go to artefacts/.
+test-browser: setup
+	$(BIN)/python -m pytest -m browser tests/view/test_browser.py
+
 test-all: setup
-	DCC_JAX_TEST_OPTIMIZED=1 $(BIN)/python -m pytest -m "slow or not slow" $(WORKERS)
+	DCC_JAX_TEST_OPTIMIZED=1 $(BIN)/python -m pytest \
+	-m "(slow or not slow) and not browser" $(WORKERS)
 
 check: setup
 	$(BIN)/ruff format --check .

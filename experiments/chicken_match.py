@@ -274,6 +274,7 @@ def main() -> None:
     options = arguments()
     runtime.ensure()
     from dcc_jax.viz import draw as pictures
+    from dcc_jax.viz import files
 
     match, runs = prepared(options)
     rows, points = [], []
@@ -291,7 +292,7 @@ def main() -> None:
             images = pictures.frames(
                 match.scene.model, film.qpos[:, 0], size=(640, 480)
             )
-            pictures.write_mp4(options.video, images, fps=30)
+            files.write_mp4(options.video, images, fps=30)
     paired.write(options.out, rows, points)
     draw(points, rows, options.out)
     paired.tell(points, options.out)

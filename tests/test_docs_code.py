@@ -31,6 +31,7 @@ from dcc_jax.evaluate.report import Report
 from dcc_jax.play.runs import find_run
 from dcc_jax.training.loop import TrainResult
 from dcc_jax.training.sweep import SweepResult
+from still import Still
 from tools import config_reference
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -103,6 +104,7 @@ def stood_in(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, result in results.items():
         real = getattr(dcc_jax, name)
         monkeypatch.setattr(dcc_jax, name, checked(real, result))
+    monkeypatch.setattr("dcc_jax.play.program.Program", Still)
 
 
 def emptied(kind: type) -> dict[str, Any]:
@@ -184,7 +186,7 @@ def test_a_pages_lines_are_where_the_page_has_them():
 
 def test_pages_have_commands_of_every_kind():
     kinds = {command.split()[1] for command in beginning_with("dcc-jax ")}
-    assert kinds == {"train", "evaluate", "render", "motion", "curves"}
+    assert kinds == {"train", "evaluate", "render", "view", "motion", "curves"}
     assert (
         beginning_with("make ") and beginning_with("python ") and beginning_with("pip ")
     )

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from dcc_jax.viz import draw
+from dcc_jax.viz import draw, files
 from dcc_jax.viz.fallback import Camera
 
 SCENE = """<mujoco><worldbody>
@@ -222,7 +222,7 @@ def test_drawing_leaves_the_environment_to_the_caller_and_its_children(libraries
     """A child that inherits a MUJOCO_GL without its library cannot import mujoco."""
     code = """
 import os, subprocess, sys
-from dcc_jax.viz import draw
+from dcc_jax.viz import draw, files
 if sys.argv[1] == "none":
     draw.find_library = lambda name: None
 before = dict(os.environ)
@@ -271,7 +271,7 @@ def test_video_holds_every_frame(tmp_path):
     imageio = pytest.importorskip("imageio.v2")
     pytest.importorskip("imageio_ffmpeg")
     images = [np.full((64, 64, 3), 20 * k, np.uint8) for k in range(7)]
-    draw.write_mp4(tmp_path / "new" / "clip.mp4", iter(images), fps=30)
+    files.write_mp4(tmp_path / "new" / "clip.mp4", iter(images), fps=30)
     with imageio.get_reader(tmp_path / "new" / "clip.mp4") as reader:
         levels = [frame.mean() for frame in reader]
         assert reader.get_meta_data()["fps"] == 30
@@ -281,7 +281,7 @@ def test_video_holds_every_frame(tmp_path):
 def test_missing_video_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(ModuleNotFoundError, match=r"dcc-jax\[video\]"):
-        draw.write_mp4(tmp_path / "clip.mp4", iter([]), fps=30)
+        files.write_mp4(tmp_path / "clip.mp4", iter([]), fps=30)
 
 
 def test_missing_ffmpeg_is_told_before_the_work(tmp_path, monkeypatch):
@@ -292,7 +292,7 @@ def test_missing_ffmpeg_is_told_before_the_work(tmp_path, monkeypatch):
 
     monkeypatch.setattr(ffmpeg, "get_ffmpeg_exe", missing)
     with pytest.raises(OSError, match=r"clip.mp4 needs ffmpeg: No ffmpeg exe"):
-        draw.check_video(tmp_path / "clip.mp4")
+        files.check_video(tmp_path / "clip.mp4")
 
 
 def test_unwritable_folder_of_a_video_is_told_before_the_work(tmp_path, monkeypatch):
@@ -300,4 +300,4 @@ def test_unwritable_folder_of_a_video_is_told_before_the_work(tmp_path, monkeypa
     # To root every folder is writable.
     monkeypatch.setattr(draw.os, "access", lambda path, mode: path != tmp_path)
     with pytest.raises(PermissionError, match=r"clip.mp4 cannot be written"):
-        draw.check_video(tmp_path / "clip.mp4")
+        files.check_video(tmp_path / "clip.mp4")

@@ -25,6 +25,7 @@ LEVELS = [
     {"training"},
     {"play", "options"},
     {"train", "evaluate", "render", "export", "__main__"},
+    {"view"},
 ]
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}
 FILES = sorted(PACKAGE.rglob("*.py"))

@@ -12,6 +12,7 @@ COMMANDS = {
     "train": ("dcc_jax.train", "train a compliant policy"),
     "evaluate": ("dcc_jax.evaluate.__main__", "measure trained policies"),
     "render": ("dcc_jax.render.__main__", "make a video of a trained policy"),
+    "view": ("dcc_jax.view.__main__", "pull a trained policy in a browser"),
     "motion": ("dcc_jax.motion.__main__", "import motion files, look at clips"),
     "curves": ("dcc_jax.training.curves", "draw how training went"),
 }

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from dcc_jax.character import FEET, Character, compose_scene, load_character
 from dcc_jax.motion.clip import Clip, velocities
-from dcc_jax.viz import draw
+from dcc_jax.viz import draw, files
 
 CONTACT_HEIGHT = 0.02  # m, a sole lower than this touches ...
 CONTACT_SPEED = 0.4  # m/s, ... when it is also slower than this
@@ -66,7 +66,7 @@ def video(clip: Clip, path: str | Path, *, fallback: bool | None = None) -> None
     Raises:
         ModuleNotFoundError: the `video` extra is not installed.
     """
-    draw.write_mp4(path, pictures(clip, fallback=fallback), clip.fps)
+    files.write_mp4(path, pictures(clip, fallback=fallback), clip.fps)
 
 
 def pictures(

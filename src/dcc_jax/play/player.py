@@ -20,10 +20,9 @@ from jax.sharding import NamedSharding, PartitionSpec
 from dcc_jax.env.config import CONTROL_RATE
 from dcc_jax.env.environment import Environment
 from dcc_jax.env.mechanics import Mechanics
-from dcc_jax.env.observation import ALPHA_ENTRY
 from dcc_jax.env.state import EnvState
 from dcc_jax.learn.rollout import Policy
-from dcc_jax.play import recording
+from dcc_jax.play import stepping
 from dcc_jax.play.recording import Frame, Recording
 from dcc_jax.play.runs import Run
 
@@ -38,8 +37,8 @@ class Player:
 
     def __init__(self, environment: Environment) -> None:
         self.environment = environment
-        mechanics = Mechanics.of(environment.scene.character)
-        self._frame = partial(recording.frame, environment, mechanics)
+        tables = Mechanics.of(environment.scene.character)
+        self._step = partial(stepping.advance, environment, tables)
         devices = jax.devices()
         self._mesh = jax.make_mesh((len(devices),), ("env",), devices=devices)
         shared, split = PartitionSpec(), PartitionSpec("env")
@@ -132,7 +131,7 @@ class Player:
         progress: Callable[[int], None],
     ) -> dict[str, Any]:
         """Plays one batch until all its episodes are over; leaves [T or C, N, ...]."""
-        keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(seed)))(episodes)
+        keys = jax.vmap(partial(stepping.episode_key, seed))(episodes)
         split = NamedSharding(self._mesh, PartitionSpec("env"))
         keys, level, observed_alpha = jax.device_put(
             (keys, alpha, observed_alpha), split
@@ -156,8 +155,7 @@ class Player:
         return _cut(joined, steps)
 
     def _reset_all(self, keys: Array, alpha: Array) -> EnvState:
-        first = jax.vmap(lambda key: jax.random.fold_in(key, 0))(keys)
-        return jax.vmap(self.environment.reset)(first, alpha)
+        return jax.vmap(partial(stepping.begin, self.environment))(keys, alpha)
 
     def _chunk(
         self,
@@ -169,15 +167,17 @@ class Player:
     ) -> tuple[EnvState, Frame, Array]:
         """CHUNK control steps of all environments of a device."""
 
-        def step(state: EnvState, time: Array) -> tuple[EnvState, Frame]:
-            action = policy.mean(state.obs.at[:, ALPHA_ENTRY].set(observed_alpha))
-            draws = jax.vmap(lambda key: jax.random.fold_in(key, time))(keys)
-            new, forces = jax.vmap(self.environment.recorded_step)(draws, state, action)
-            return new, jax.vmap(self._frame)(state, new, forces)
+        def step(state: EnvState, count: Array) -> tuple[EnvState, Frame]:
+            def one(
+                state: EnvState, key: Array, observed_alpha: Array
+            ) -> tuple[EnvState, Frame]:
+                return self._step(policy, state, key, observed_alpha, count)
+
+            return jax.vmap(one)(state, keys, observed_alpha)
 
         # Zero is the key of the reset.
-        times = 1 + CHUNK * chunk + jnp.arange(CHUNK)
-        state, frames = jax.lax.scan(step, state, times)
+        counts = 1 + CHUNK * chunk + jnp.arange(CHUNK)
+        state, frames = jax.lax.scan(step, state, counts)
         pairs = self.environment.style_coordinates(
             state.previous_features, state.features
         )

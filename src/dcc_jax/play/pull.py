@@ -47,14 +47,16 @@ class Hands:
 
 def no_hands() -> Hands:
     """Hands that do nothing."""
-    return Hands(
-        body=np.zeros(HANDS, np.int32),
-        point=np.zeros((HANDS, 3), np.float32),
-        target_w=np.zeros((HANDS, 3), np.float32),
-        stiffness=np.zeros(HANDS, np.float32),
-        damping=np.zeros(HANDS, np.float32),
-        force_w=np.zeros((HANDS, 3), np.float32),
-    )
+    one, three = np.zeros(HANDS, np.float32), np.zeros((HANDS, 3), np.float32)
+    rows: dict[str, Any] = {
+        "body": np.zeros(HANDS, np.int32),
+        "point": three,
+        "target_w": three,
+        "stiffness": one,
+        "damping": one,
+        "force_w": three,
+    }
+    return Hands(**rows)
 
 
 @flax.struct.dataclass

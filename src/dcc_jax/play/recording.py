@@ -7,6 +7,7 @@ control steps, E coordinates of a style pair.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import flax.struct
 import jax
@@ -120,6 +121,7 @@ def _numbers(
         "slip": slip,
         "stands": stands,
         "range_excess": jnp.max(mechanics.range_excess(tables, q)),
+        "r_q": state.r_q,
         "r_p": state.r_p,
         "r_task": state.r_task,
     }
@@ -151,6 +153,11 @@ def displaced(environment: Environment, motion: Motion) -> np.ndarray:
     the reference has no time, and the ghost is the pose q (-) u that the discriminator
     judges: what the character would do without u, the gap between the two being u.
     """
+    return np.asarray(_displaced(environment, motion))
+
+
+@partial(jax.jit, static_argnums=0)
+def _displaced(environment: Environment, motion: Motion) -> Array:
     scene, coords = environment.scene, environment.kinematics.coords
     qpos = jnp.asarray(motion.qpos)
     if environment.tracks_reference:
@@ -158,4 +165,4 @@ def displaced(environment: Environment, motion: Motion) -> np.ndarray:
     else:
         ghost = quat.ominus(coords, scene.character_qpos(qpos), motion.u)
     end = scene.qpos_adr + scene.character.nq
-    return np.asarray(qpos.at[..., scene.qpos_adr : end].set(ghost))
+    return qpos.at[..., scene.qpos_adr : end].set(ghost)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -47,6 +48,17 @@ def find_run(name: str | Path) -> Run:
         within = ", ".join(sorted(p.parent.name for p in path.glob("*/policy.npz")))
         raise ValueError(f"{name} is a sweep; its runs are {within or 'not begun'}")
     return Run(str(name), config.load(path), checkpoint.load_policy(path))
+
+
+def known_runs() -> list[str]:
+    """Names of all policies at hand: those that ship, then those in `runs/`."""
+    shipped: list[str] = []
+    with contextlib.suppress(FileNotFoundError):
+        shipped = [p.parent.name for p in asset_path("policies").glob("*/policy.npz")]
+    order = list(tasks.TASKS)
+    shipped.sort(key=lambda name: (order.index(name) if name in order else 99, name))
+    own = sorted(str(p.parent) for p in Path("runs").glob("**/policy.npz"))
+    return shipped + own
 
 
 def _shipped(name: str) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -34,14 +35,29 @@ class Options:
     out: Annotated[
         Path | None,
         arg(
-            metavar="FILE.mp4",
-            help_behavior_hint="(default: RUN_DIR.mp4, without --strip)",
+            metavar="FILE.mp4|FILE.gif",
+            help_behavior_hint="(default: RUN_DIR.mp4, without --strip and --gif)",
         ),
     ] = None
-    """The video."""
+    """The video, 1280 x 720."""
+
+    gif: Annotated[
+        Path | None, arg(metavar="FILE.gif", help_behavior_hint="(default: none)")
+    ] = None
+    """The same as a small looping picture, 480 wide."""
 
     seconds: Annotated[float, arg(metavar="S")] = 8.0
-    """Length of the video."""
+    """How long the policy plays."""
+
+    slow: Annotated[float, arg(metavar="TIMES")] = 1.0
+    """Slow motion: how many times slower than real."""
+
+    camera: Annotated[
+        tuple[float, ...],
+        arg(metavar="A [E [D]]", help_behavior_hint="(default: the task's)"),
+    ] = ()
+    """Azimuth in degrees (90 looks to the left, 180 from the front), elevation in
+    degrees (-12 looks down a little), distance in m."""
 
     alpha: Annotated[
         float | None,
@@ -84,8 +100,9 @@ def _film(plan: FilmPlan) -> None:
     if shot.falls:
         print(f"{shot.falls} falls: where one episode ends the next one begins")
     console = Console(stderr=True)
-    film.write(plan, track(shot.images, "drawing", total=shot.count, console=console))
-    for path in (plan.out, plan.strip):
+    drawn = track(shot.images, "drawing", total=shot.count, console=console)
+    film.write(plan, dataclasses.replace(shot, images=iter(drawn)))
+    for path in (plan.out, plan.gif, plan.strip):
         if path is not None:
             print(f"wrote {path}")
 

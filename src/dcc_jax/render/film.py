@@ -1,12 +1,11 @@
-"""Episodes of a policy as pictures: forces as arrows, u as a ghost.
+"""Films of a policy: what is played, checked and written.
 
 Letters: T frames, one a control step.
 """
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,15 +17,19 @@ from matplotlib.image import imsave
 from dcc_jax.env.config import CONTROL_RATE
 from dcc_jax.env.task import Task
 from dcc_jax.play.player import Player
-from dcc_jax.play.recording import Motion, Recording, displaced
+from dcc_jax.play.recording import Recording
 from dcc_jax.play.runs import Run, find_run, make_environment
-from dcc_jax.viz import draw
+from dcc_jax.render import pictures
+from dcc_jax.viz import files
 
 EPISODES = 8  # played at once; the next one begins where one ends by a fall
 AFTERMATH = 6  # frames that a fall is still followed; only soles meet the ground
-LONGEST_ARROW = 0.7  # m, of the largest force in the video
-ECHO = 6  # frames in which the arrow of a force fades: a ball touches for one or two
 SHEET = (4, 3)  # pictures across and down
+SIZE = (1280, 720)  # pixels, of a film
+SHRINK = 2  # a page shows pictures at a share of the film's size, so its edges are soft
+GIF_WIDTH, GIF_RATE = 480, 15.0  # pixels, and pictures a second
+CAMERA = (130.0, -12.0, 3.4)  # azimuth and elevation in degrees, distance in m
+SLOWEST = 16.0
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,10 @@ class FilmPlan:
     seed: int
     out: Path | None
     strip: Path | None
+    gif: Path | None = None
+    slow: float = 1.0
+    camera: tuple[float, ...] = ()
+    size: tuple[int, int] = SIZE
 
 
 @dataclass(frozen=True)
@@ -60,24 +67,34 @@ def render(
     seed: int = 0,
     strip: str | Path | None = None,
     task: Mapping[str, Any] | Task | None = None,
+    gif: str | Path | None = None,
+    camera: Sequence[float] = (),
+    slow: float = 1.0,
 ) -> None:
     """Films the mean action of a policy.
 
     Args:
         run_dir: a run directory, or a policy that ships.
-        out: the mp4; None: `<name of the run>.mp4`, or none where there is a strip.
-        seconds: of the video; after a fall the next episode follows.
+        out: the mp4; None: `<name of the run>.mp4`, or none where there is a strip or
+            a gif.
+        seconds: that are played; after a fall the next episode follows.
         alpha: level of compliance; None: the greatest of the training.
         seed: of everything that is drawn.
         strip: a picture of frames side by side.
         task: other parameters of the run's task, `{"width": 1.5}`, or another task.
+        gif: a small looping film.
+        camera: azimuth and elevation in degrees, distance in m, or the first of them;
+            azimuth 90 looks along +y, 180 along -x.
+        slow: how many times slower than real.
 
     Raises:
         ValueError: naming the argument, its value and what is allowed.
         ModuleNotFoundError: the `video` extra is not installed.
     """
-    plan = prepare(run_dir, out, seconds, alpha, seed, strip, task)
-    write(plan, play(plan).images)
+    plan = prepare(
+        run_dir, out, seconds, alpha, seed, strip, task, gif, tuple(camera), slow
+    )
+    write(plan, play(plan))
 
 
 def prepare(
@@ -88,6 +105,9 @@ def prepare(
     seed: int,
     strip: str | Path | None,
     task: Mapping[str, Any] | Task | None,
+    gif: str | Path | None = None,
+    camera: tuple[float, ...] = (),
+    slow: float = 1.0,
 ) -> FilmPlan:
     """Checks everything a user can get wrong; arguments as of `render`."""
     if not 0.1 <= seconds <= 3600.0:
@@ -96,14 +116,19 @@ def prepare(
         raise ValueError(f"alpha must be in [0, 1], got {alpha}")
     if not 0 <= seed < 2**32:
         raise ValueError(f"seed must be between 0 and 2^32 - 1, got {seed}")
+    _check_camera(camera)
+    if not 1.0 <= slow <= SLOWEST:
+        raise ValueError(f"slow must be in [1, {SLOWEST:g}], got {slow}")
     run = find_run(run_dir)
-    if out is None and strip is None:
+    if out is None and strip is None and gif is None:
         out = f"{Path(run.name).resolve().name}.mp4"
     if out is not None:
-        _check_ending("out", out, ".mp4")
-        draw.check_video(out)
+        _check_ending("out", out, ".mp4", ".gif")
+        files.check_video(out)
     if strip is not None:
         _check_ending("strip", strip, ".png")
+    if gif is not None:
+        _check_ending("gif", gif, ".gif")
     return FilmPlan(
         run=run,
         player=Player(make_environment(run, task)),
@@ -112,12 +137,25 @@ def prepare(
         seed=seed,
         out=None if out is None else Path(out),
         strip=None if strip is None else Path(strip),
+        gif=None if gif is None else Path(gif),
+        slow=slow,
+        camera=camera,
     )
 
 
-def _check_ending(name: str, path: str | Path, ending: str) -> None:
-    if Path(path).suffix.lower() != ending:
-        raise ValueError(f"{name} must end in {ending}, got {path}")
+def _check_camera(camera: tuple[float, ...]) -> None:
+    azimuth, elevation, distance = (*camera, *CAMERA[len(camera) :])[:3]
+    angles = -360.0 <= azimuth <= 360.0 and -90.0 <= elevation <= 90.0
+    if len(camera) > 3 or not angles or not 0.1 <= distance <= 100.0:
+        raise ValueError(
+            "camera must be an azimuth, an elevation in [-90, 90] degrees and a "
+            f"distance in [0.1, 100] m, or the first of them, got {list(camera)}"
+        )
+
+
+def _check_ending(name: str, path: str | Path, *endings: str) -> None:
+    if Path(path).suffix.lower() not in endings:
+        raise ValueError(f"{name} must end in {' or '.join(endings)}, got {path}")
     Path(path).parent.mkdir(parents=True, exist_ok=True)
 
 
@@ -132,44 +170,40 @@ def play(plan: FilmPlan) -> Shot:
         motion=True,
     )
     times, episodes = _cut(recording, round(plan.seconds * CONTROL_RATE))
-    if plan.out is None:
-        chosen = _evenly(len(times), SHEET[0] * SHEET[1])
+    still = plan.out is None and plan.gif is None
+    if still:
+        chosen = pictures.evenly(len(times), SHEET[0] * SHEET[1])
         times, episodes = times[chosen], episodes[chosen]
-    images = _images(plan, recording, times, episodes)
-    return Shot(images, len(times), int(recording.fell[np.unique(episodes)].sum()))
+    slow = 1.0 if still else plan.slow
+    images = _images(plan, recording, times, episodes, still, slow)
+    falls = int(recording.fell[np.unique(episodes)].sum())
+    return Shot(images, len(pictures.moments(len(times), slow)), falls)
 
 
-def write(plan: FilmPlan, images: Iterable[np.ndarray]) -> None:
-    """Writes the video and the page of pictures that were asked for."""
-    kept: list[np.ndarray] = []
+def write(plan: FilmPlan, shot: Shot) -> None:
+    """Writes the video, the gif and the page of pictures that were asked for."""
+    small: list[np.ndarray] = []
+    page: list[np.ndarray] = []
+    chosen = pictures.evenly(shot.count, SHEET[0] * SHEET[1])
+    every = round(CONTROL_RATE / GIF_RATE)
+
+    def noted() -> Iterator[np.ndarray]:
+        for index, image in enumerate(shot.images):
+            if plan.gif is not None and index % every == 0:
+                small.append(pictures.shrunk(image, GIF_WIDTH))
+            if plan.strip is not None and index in chosen:
+                page.append(pictures.shrunk(image, image.shape[1] // SHRINK))
+            yield image
+
     if plan.out is None:
-        kept = list(images)
+        for _ in noted():
+            pass
     else:
-        draw.write_mp4(plan.out, _kept(images, kept), CONTROL_RATE)
+        files.write_film(plan.out, noted(), CONTROL_RATE)
+    if plan.gif is not None:
+        files.write_gif(plan.gif, small, GIF_RATE)
     if plan.strip is not None:
-        chosen = _evenly(len(kept), SHEET[0] * SHEET[1])
-        imsave(plan.strip, sheet([kept[i] for i in chosen], SHEET[0]))
-
-
-def sheet(images: list[np.ndarray], across: int) -> np.ndarray:
-    """Pictures of one size side by side, `across` in a row, white at the end."""
-    blank = np.full_like(images[0], 255)
-    filled = images + [blank] * (-len(images) % across)
-    rows = [
-        np.concatenate(filled[i : i + across], axis=1)
-        for i in range(0, len(filled), across)
-    ]
-    return np.concatenate(rows)
-
-
-def _kept(images: Iterable[np.ndarray], kept: list[np.ndarray]) -> Iterator[np.ndarray]:
-    for image in images:
-        kept.append(image)
-        yield image
-
-
-def _evenly(count: int, wanted: int) -> np.ndarray:
-    return np.unique(np.linspace(0, count - 1, min(wanted, count)).round().astype(int))
+        imsave(plan.strip, pictures.sheet(page, SHEET[0]))
 
 
 def _cut(recording: Recording, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -183,56 +217,26 @@ def _cut(recording: Recording, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _images(
-    plan: FilmPlan, recording: Recording, times: np.ndarray, episodes: np.ndarray
+    plan: FilmPlan,
+    recording: Recording,
+    times: np.ndarray,
+    episodes: np.ndarray,
+    still: bool,
+    slow: float,
 ) -> Iterator[np.ndarray]:
     environment = plan.player.environment
     assert recording.motion is not None
     motion = jax.tree.map(lambda x: x[times, episodes], recording.motion)
-    return draw.frames(
-        environment.scene.model,
-        motion.qpos,
-        camera=_view(environment.task, still=plan.out is None),
-        ghost_qpos=displaced(environment, motion),
-        arrows=_arrows(recording.motion, times, episodes),
+    return pictures.pictures(
+        environment,
+        motion,
+        episodes,
+        arrows=pictures.arrows(recording.motion, times, episodes),
         captions=_captions(plan, recording, times, episodes),
-        mocap=(motion.mocap_pos, motion.mocap_quat),
+        view=pictures.view_of(environment.task, plan.camera, still),
+        size=plan.size,
+        slow=slow,
     )
-
-
-def _view(task: Task, still: bool) -> draw.View:
-    """Where the camera is; it lags behind in a video, not on a page of pictures."""
-    view = draw.View(
-        azimuth=task.camera_azimuth,
-        distance=task.camera_distance,
-        height=task.camera_height,
-    )
-    return dataclasses.replace(view, smooth=0.0) if still else view
-
-
-def _arrows(
-    motion: Motion, times: np.ndarray, episodes: np.ndarray
-) -> list[list[draw.Arrow]]:
-    """Of each frame. A force fades over `ECHO` frames, so that one can see it."""
-    force, point = np.asarray(motion.force_w), np.asarray(motion.point_w)
-    size = np.linalg.norm(force, axis=-1)
-    scale = LONGEST_ARROW / max(float(size[times, episodes].max()), 1e-6)
-    frames = []
-    for time, episode in zip(times, episodes, strict=True):
-        begin = max(0, time - ECHO + 1)
-        recent = size[begin : time + 1, episode]  # [at most ECHO, F]
-        fading = 1.0 - (len(recent) - 1 - np.arange(len(recent))) / ECHO
-        faded = recent * fading[:, None]
-        last = faded.argmax(axis=0)
-        frames.append(
-            [
-                (
-                    point[begin + at, episode, f],
-                    scale * fading[at] * force[begin + at, episode, f],
-                )
-                for f, at in enumerate(last)
-            ]
-        )
-    return frames
 
 
 def _captions(
@@ -240,12 +244,14 @@ def _captions(
 ) -> list[str]:
     numbers = {name: x[times, episodes] for name, x in recording.numbers.items()}
     alive = recording.alive[times, episodes]
-    head = f"{plan.player.environment.task.name}  alpha {plan.alpha:g}"
+    name = plan.player.environment.task.name
     return [
-        f"{head}  {(time + 1) / CONTROL_RATE:.2f} s"
-        f"  force {numbers['force_peak'][i]:.0f} N"
-        f"  u {np.degrees(numbers['displacement'][i]):.1f} deg"
-        f"  {100 * numbers['root_displacement'][i]:.1f} cm"
-        f"{'' if alive[i] else '  fell'}"
+        pictures.caption(
+            name,
+            plan.alpha,
+            (time + 1) / CONTROL_RATE,
+            {k: x[i] for k, x in numbers.items()},
+        )
+        + ("" if alive[i] else "  fell")
         for i, time in enumerate(times)
     ]

@@ -1,4 +1,4 @@
-"""Pictures of a MuJoCo model along a motion, and videos of them.
+"""Pictures of a MuJoCo model along a motion.
 
 MuJoCo's offscreen renderer draws where there is a display, libOSMesa or libEGL;
 elsewhere matplotlib draws the shapes of the bodies. `MUJOCO_GL` decides
@@ -16,7 +16,6 @@ from collections.abc import Iterator, Sequence
 from ctypes.util import find_library
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -229,47 +228,3 @@ def _add_ghost(
     for geom in scene.geoms[first : scene.ngeom]:
         geom.rgba[:] = GHOST if apart[geom.objid] else 0.0
         geom.matid = -1
-
-
-def check_video(path: str | Path) -> None:
-    """Finds out before the work whether `write_mp4` can write a video.
-
-    Raises:
-        ModuleNotFoundError: the `video` extra is not installed.
-        OSError: there is no ffmpeg, or the folder cannot be written to.
-    """
-    try:
-        import imageio.v2  # noqa: F401
-        import imageio_ffmpeg
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            f"writing {path} needs {error.name}: pip install 'dcc-jax[video]'"
-        ) from None
-    try:
-        imageio_ffmpeg.get_ffmpeg_exe()
-    except RuntimeError as error:
-        raise OSError(f"writing {path} needs ffmpeg: {error}") from None
-    if not os.access(Path(path).parent, os.W_OK):
-        raise PermissionError(f"{path} cannot be written there: choose another place")
-
-
-def write_mp4(path: str | Path, images: Iterator[np.ndarray], fps: float) -> None:
-    """Writes images [height, width, 3] uint8 as an H.264 video.
-
-    Raises:
-        ModuleNotFoundError: the `video` extra is not installed.
-        OSError: there is no ffmpeg, or the file cannot be written.
-    """
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    check_video(path)
-    import imageio.v2 as imageio
-
-    with warnings.catch_warnings():
-        # jax warns of any child process; ffmpeg shares nothing with it.
-        warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called")
-        writer: Any = imageio.get_writer(
-            path, fps=fps, codec="libx264", quality=8, macro_block_size=2
-        )
-        with writer:
-            for image in images:
-                writer.append_data(image)
