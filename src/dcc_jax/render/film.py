@@ -112,14 +112,14 @@ def prepare(
     """Checks everything a user can get wrong; arguments as of `render`."""
     if not 0.1 <= seconds <= 3600.0:
         raise ValueError(f"seconds must be in [0.1, 3600], got {seconds}")
-    if alpha is not None and not 0.0 <= alpha <= 1.0:
-        raise ValueError(f"alpha must be in [0, 1], got {alpha}")
     if not 0 <= seed < 2**32:
         raise ValueError(f"seed must be between 0 and 2^32 - 1, got {seed}")
     _check_camera(camera)
     if not 1.0 <= slow <= SLOWEST:
         raise ValueError(f"slow must be in [1, {SLOWEST:g}], got {slow}")
     run = find_run(run_dir)
+    if alpha is not None:
+        run.config.env.compliance.check_alpha(alpha)
     if out is None and strip is None and gif is None:
         out = f"{Path(run.name).resolve().name}.mp4"
     if out is not None:
