@@ -136,7 +136,8 @@ class Push(Task):
         """The ball's contacts with each of `TARGETS`, F = 6."""
         hit = scene.contacts([scene.body("ball")])
         return state, Forces(
-            force_w=-hit.sign[:, None] * solution.contact_force_w[hit.slots],
+            force_w=-jnp.asarray(hit.sign)[:, None]
+            * solution.contact_force_w[hit.slots],
             point_w=solution.contact_point_w[hit.slots],
             body=jnp.asarray(hit.other),
             gate=jnp.ones((), bool),
