@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 
 from dcc_jax import physics, quat
 from dcc_jax.character import Character, asset_path, compose_scene
+from dcc_jax.control.config import ComplianceConfig
 from dcc_jax.env.config import EnvConfig
 from dcc_jax.env.environment import Environment
 from dcc_jax.motion.clip import load_clip
@@ -32,7 +33,8 @@ INERTIA = (
 @pytest.fixture(scope="module")
 def environment(character: Character) -> Environment:
     references = make_references([load_clip(asset_path("motions/stand.npz"))])
-    return Environment(TASK, character, references, EnvConfig())
+    law = ComplianceConfig(law="algorithm_1")  # as a training of this task has it
+    return Environment(TASK, character, references, EnvConfig(compliance=law))
 
 
 # The scene.
