@@ -21,8 +21,18 @@ evaluate = importlib.import_module("dcc_jax.evaluate.__main__")
 render = importlib.import_module("dcc_jax.render.__main__")
 
 
+BY_DEFAULT = ("push", "door")
+"""One taught by the discriminator and one by tracking; `make test-all` has the others:
+each compiles three programs of its own."""
+
+
+def _marks(task: str) -> list[pytest.MarkDecorator]:
+    group = pytest.mark.xdist_group(task)
+    return [group] if task in BY_DEFAULT else [group, pytest.mark.slow]
+
+
 @pytest.mark.parametrize(
-    "task", [pytest.param(task, marks=pytest.mark.xdist_group(task)) for task in TASKS]
+    "task", [pytest.param(task, marks=_marks(task)) for task in TASKS]
 )
 def test_task_trains_is_evaluated_and_drawn(
     task: str,
