@@ -119,8 +119,8 @@ def test_sweep_that_cannot_go_on_is_one_line(result, changes, said):
 
 
 def test_one_seed_and_one_alpha_need_no_sequence():
-    assert sweeping._settings(3, 0.16) == [(3, 0.16)]
-    assert sweeping._settings(range(2), None) == [(0, None), (1, None)]
+    assert sweeping._settings(toy_config(1), 3, 0.16) == [(3, 0.16)]
+    assert sweeping._settings(toy_config(1), range(2), None) == [(0, None), (1, None)]
 
 
 @pytest.mark.parametrize(
@@ -129,12 +129,12 @@ def test_one_seed_and_one_alpha_need_no_sequence():
         ((1, 1), None, "must be different numbers"),
         (1, (0.1, 0.1), "must be different numbers"),
         (-1, None, r"seeds must be between 0 and 2\^32 - 1, got -1"),
-        (1, 1.5, r"alpha must be in \[0, 1\], got 1.5"),
+        (1, 1.5, r"alpha must be in \[0, 0.9\], got 1.5"),
     ],
 )
 def test_runs_that_make_no_sense_are_named(seeds, alpha, said):
     with pytest.raises(ValueError, match=said):
-        sweeping._settings(seeds, alpha)
+        sweeping._settings(toy_config(1), seeds, alpha)
 
 
 def test_table_has_a_row_for_every_run_and_update(result):

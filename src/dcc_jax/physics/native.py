@@ -20,6 +20,7 @@ from functools import cache
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from dcc_jax.physics.sparsity import Arrow
@@ -78,9 +79,8 @@ def newton(
         vmap_method="broadcast_all",
     )
     qacc, force = call(
-        *(mass, smooth, J, D, aref, start),
+        *(mass, smooth, J, D, aref, start, jnp.asarray(iterations, jnp.int32)),
         structure=_packed(shape, num_equality),
-        iterations=np.int32(iterations),
     )
     return qacc, force
 

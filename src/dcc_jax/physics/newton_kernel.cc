@@ -288,9 +288,11 @@ void Block::solve(const int* env, int count, float* qacc, float* force) {
 ffi::Error Newton(ffi::Buffer<ffi::F32> mass, ffi::Buffer<ffi::F32> smooth,
                   ffi::Buffer<ffi::F32> J, ffi::Buffer<ffi::F32> D,
                   ffi::Buffer<ffi::F32> aref, ffi::Buffer<ffi::F32> start,
+                  ffi::Buffer<ffi::S32> most,
                   ffi::ResultBuffer<ffi::F32> qacc, ffi::ResultBuffer<ffi::F32> force,
-                  ffi::Span<const int32_t> structure, int32_t iterations) {
-  Block block(structure, iterations);
+                  ffi::Span<const int32_t> structure) {
+  // The same number for every environment of a batch.
+  Block block(structure, most.typed_data()[0]);
   const int64_t batch = smooth.element_count() / block.nv;
   for (int64_t first = 0; first < batch; first += kLanes) {
     int env[kLanes];
@@ -315,7 +317,7 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(
         .Arg<ffi::Buffer<ffi::F32>>()
         .Arg<ffi::Buffer<ffi::F32>>()
         .Arg<ffi::Buffer<ffi::F32>>()
+        .Arg<ffi::Buffer<ffi::S32>>()
         .Ret<ffi::Buffer<ffi::F32>>()
         .Ret<ffi::Buffer<ffi::F32>>()
-        .Attr<ffi::Span<const int32_t>>("structure")
-        .Attr<int32_t>("iterations"));
+        .Attr<ffi::Span<const int32_t>>("structure"));
