@@ -38,7 +38,7 @@ ENOUGH = {
     "curves": ["/none/here"],
     "import": ["/none/here.bvh", "--out", "/none/here.npz"],
     "inspect": ["/none/here.npz"],
-    "export": ["push"],
+    "export": ["push", "--out", "/none/here.bvh"],
 }
 
 
