@@ -196,7 +196,7 @@ def main() -> None:
     options = parser.parse_args()
     if not 0.0 < options.force < np.inf:
         parser.error(f"argument --force: must be positive, got {options.force}")
-    if not 0.0 < options.alpha <= ComplianceConfig().greatest_alpha:
+    if not 0.0 < options.alpha <= ComplianceConfig(law="admittance").greatest_alpha:
         parser.error(f"argument --alpha: must be in (0, 0.9], got {options.alpha}")
     options.out.mkdir(parents=True, exist_ok=True)
     scene = held_scene(load_character())

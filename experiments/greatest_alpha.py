@@ -39,7 +39,7 @@ def levels(clip: str, body: str, newtons: float) -> np.ndarray:
     model = compose_scene(character, floor=False)
     coords = quat.Coordinates.of(model)
     controller = compliance.Controller.of(
-        ComplianceConfig(), character, coords, 1 / 240
+        ComplianceConfig(law="admittance"), character, coords, 1 / 240
     )
     frames = load_clip(asset_path(f"motions/{clip}.npz")).qpos
     q = frames[np.linspace(0, len(frames) - 1, POSES).astype(int)]
