@@ -1,6 +1,6 @@
 """Pushed balance (Sec. 5.2): 1 kg balls thrown at a standing character from all sides.
 
-The force fed to the compliance is the strongest contact of a ball with the character.
+The forces fed to the compliance are the contacts of a ball with the character.
 
 The ball slides along x, y and z and does not spin: its unknowns are coupled with all of
 the character's, and three of them instead of six make those matrices smaller.
@@ -133,14 +133,13 @@ class Push(Task):
         solution: physics.Solution,
         action: Array,
     ) -> tuple[PushState, Forces]:
-        """The strongest contact of the ball, F = 1."""
+        """The ball's contacts with each of `TARGETS`, F = 6."""
         hit = scene.contacts([scene.body("ball")])
-        force = -hit.sign[:, None] * solution.contact_force_w[hit.slots]
-        strongest = jnp.argmax(jnp.sum(force * force, axis=-1))
         return state, Forces(
-            force_w=force[strongest][None],
-            point_w=solution.contact_point_w[hit.slots][strongest][None],
-            body=jnp.asarray(hit.other)[strongest][None],
+            force_w=-jnp.asarray(hit.sign)[:, None]
+            * solution.contact_force_w[hit.slots],
+            point_w=solution.contact_point_w[hit.slots],
+            body=jnp.asarray(hit.other),
             gate=jnp.ones((), bool),
         )
 
