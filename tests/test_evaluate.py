@@ -293,7 +293,7 @@ def _damaged(push: Path, folder: Path) -> Path:
         (["/none/here"], ["/none/here is not a run directory"]),
         (["{push}", "--episodes", "0"], ["episodes must be 1 or more, got 0"]),
         (["{push}", "--episodes", "many"], ["--episodes", "many"]),
-        (["{push}", "--alpha", "1.5"], ["alpha must be in [0, 1], got 1.5"]),
+        (["{push}", "--alpha", "1.5"], ["alpha must be in [0, 0.9], got 1.5"]),
         (["{push}", "--alpha", "0.1", "0.1"], ["alpha must be different"]),
         (["{push}", "--seconds", "0"], ["seconds must be in", "got 0.0"]),
         (["{push}", "--seed", "-1"], ["seed must be", "-1"]),

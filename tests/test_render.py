@@ -207,7 +207,7 @@ def test_without_opengl_matplotlib_draws(plan, monkeypatch):
         (["{push}", "--camera", "0", "99"], ["camera must be", "[0.0, 99.0]"]),
         (["{push}", "--seconds", "0"], ["seconds must be in", "got 0.0"]),
         (["{push}", "--seconds", "nan"], ["seconds must be in", "got nan"]),
-        (["{push}", "--alpha", "-1"], ["alpha must be in [0, 1], got -1.0"]),
+        (["{push}", "--alpha", "-1"], ["alpha must be in [0, 0.9], got -1.0"]),
         (["{push}", "--seed", "x"], ["--seed", "'x'"]),
         (["{push}", "--bogus"], ["--bogus"]),
     ],

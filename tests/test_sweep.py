@@ -129,7 +129,7 @@ def test_one_seed_and_one_alpha_need_no_sequence():
         ((1, 1), None, "must be different numbers"),
         (1, (0.1, 0.1), "must be different numbers"),
         (-1, None, r"seeds must be between 0 and 2\^32 - 1, got -1"),
-        (1, 1.5, r"alpha must be in \[0, 1\], got 1.5"),
+        (1, 1.5, r"alpha must be in \[0, 0.9\], got 1.5"),
     ],
 )
 def test_runs_that_make_no_sense_are_named(seeds, alpha, said):

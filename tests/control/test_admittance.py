@@ -21,9 +21,7 @@ CHARACTER = load_character()
 MODEL = CHARACTER.spec().compile()
 COORDS = quat.Coordinates.of(MODEL)
 DT = 1.0 / 240.0
-CONTROLLER = compliance.Controller.of(
-    ComplianceConfig(law="admittance"), CHARACTER, COORDS, DT
-)
+CONTROLLER = compliance.Controller.of(ComplianceConfig(), CHARACTER, COORDS, DT)
 REST = compliance.at_rest(COORDS)
 BATCH, STEPS = 64, 240
 HAND = 1 + CHARACTER.body_names.index("left_hand")

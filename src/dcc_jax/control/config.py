@@ -18,7 +18,7 @@ class ComplianceConfig:
         ValueError: an unknown `law`, or a number that is not positive and finite.
     """
 
-    law: Law = "algorithm_1"
+    law: Law = "admittance"
     """How forces displace the reference: Alg. 1 as printed; Eq. (8) with measured
     velocities, for a task that follows its reference in time; or Eq. (6) and (7) solved
     for u, which holds its stiffness while the character moves."""
