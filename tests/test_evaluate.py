@@ -81,8 +81,10 @@ def _play(
 
 @pytest.fixture(scope="module")
 def recordings(plan: report.EvaluationPlan) -> tuple[Recording, Recording]:
-    """At alpha = 0 and at the largest there is, where the difference shows."""
-    return _play(plan, 0.0), _play(plan, 1.0)
+    """At alpha = 0 and at the largest that the law has, where the difference shows."""
+    run, _ = plan.conditions[0]
+    greatest = run.config.env.compliance.greatest_alpha
+    return _play(plan, 0.0), _play(plan, greatest)
 
 
 def test_levels_of_compliance_meet_the_same_balls(recordings):
