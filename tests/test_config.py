@@ -36,6 +36,8 @@ def test_paper_preset_has_the_papers_numbers():
     assert made.ppo.sigma_degrees == 6.0
     assert made.disc.minibatch_size == 16
     assert made.disc.learning_rate == 1e-4
+    assert made.disc.gradient_penalty == 10.0
+    assert made.disc.instance_noise == 0.0
     assert made.env.physics_rate == 600
 
 

@@ -58,7 +58,7 @@ def pooled(parts: Normalizer) -> Normalizer:
     return Normalizer(jnp.sum(parts.count), mean, variance)
 
 
-def normalize(n: Normalizer, x: Array) -> Array:
-    """(x - mean) / std of x [..., O], clipped to +-10."""
-    std = jnp.maximum(jnp.sqrt(n.variance), MIN_STD)
+def normalize(n: Normalizer, x: Array, floor: float = MIN_STD) -> Array:
+    """(x - mean) / std of x [..., O], clipped to +-10; the std is `floor` or more."""
+    std = jnp.maximum(jnp.sqrt(n.variance), floor)
     return jnp.clip((x - n.mean) / std, -CLIP, CLIP)

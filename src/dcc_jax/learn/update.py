@@ -105,19 +105,24 @@ def _train_discriminator(
     """
     size = config.disc.minibatch_size // jax.lax.axis_size(AXIS)
     count = config.disc.minibatches * size
-    expert_key, row_key = jax.random.split(key)
+    expert_key, row_key, noise_key = jax.random.split(key, 3)
     expert = Pairs(*environment.expert_pairs(expert_key, count))
     flat = jax.tree.map(_flat, pairs)
     rows = jax.random.randint(row_key, (count,), 0, flat.s.shape[0])
     policy = jax.tree.map(lambda x: x[rows], flat)
 
-    def minibatches(pairs: Pairs) -> Array:
-        x = discriminator.inputs(state.feature_normalizer, pairs)
+    clean = [
+        discriminator.inputs(state.feature_normalizer, pairs, config.disc)
+        for pairs in (expert, policy)
+    ]
+
+    def minibatches(key: Array, x: Array) -> Array:
+        x = discriminator.blurred(key, x, flat.s.shape[-1], config.disc)
         return x.reshape(config.disc.minibatches, size, -1)
 
-    disc, metrics = discriminator.update(
-        state.disc, minibatches(expert), minibatches(policy), config.disc, AXIS
-    )
+    noisy = map(minibatches, jax.random.split(noise_key), clean)
+    disc, metrics = discriminator.update(state.disc, *noisy, config.disc, AXIS)
+    metrics |= discriminator.judged(disc.params, *clean)
     both = jnp.concatenate([policy.s_next, expert.s_next])
     return disc, metrics, normalizer.moments(both)
 
@@ -133,7 +138,9 @@ def _rewards(
     if environment.tracks_reference:
         r_q = transitions.r_q
     else:
-        x = discriminator.inputs(state.feature_normalizer, transitions.pairs)
+        x = discriminator.inputs(
+            state.feature_normalizer, transitions.pairs, config.disc
+        )
         r_q = rewards.pose_reward(discriminator.score(state.disc.params, x), weights)
     r_task = transitions.r_task if environment.has_task_reward else None
     total = rewards.reward(r_q, transitions.r_p, weights, r_task)
