@@ -168,3 +168,52 @@ def test_table_has_the_arms_and_what_compliance_alone_does():
     ]
     values = [cell.split()[0] for cell in row.split(" | ")[1:]]
     assert values == ["10000", "9000", "8500", "-1000", "-1500", "+500"]
+
+
+def test_survivable_impulse_is_where_half_of_them_fall():
+    survival = importlib.import_module("survivable_impulse")
+    rng = np.random.default_rng(0)
+    impulse = rng.uniform(0.1, 2.5, 4000)
+    chance = 1.0 / (1.0 + np.exp(-6.0 * (np.log(impulse) - np.log(0.8))))
+    fell = rng.uniform(size=4000) < chance
+    assert survival.survivable(impulse, fell) == pytest.approx(0.8, rel=0.05)
+
+
+def test_sectors_of_the_survivable_impulse_are_those_of_the_push():
+    survival = importlib.import_module("survivable_impulse")
+    rng = np.random.default_rng(0)
+    angle, impulse = rng.uniform(-np.pi, np.pi, 800), rng.uniform(0.1, 2.5, 800)
+    limit = np.where(np.abs(angle) < np.pi / 8, 1.5, 0.5)  # stronger to the front
+    rows = [
+        {
+            "alpha": 0.0,
+            "u_on": True,
+            "task/angle/max": a,
+            "task/impulse/max": i,
+            "fell": i > most,
+        }
+        for a, i, most in zip(angle, impulse, limit, strict=True)
+    ]
+    points = survival.by_sector(rows, {"alpha": 0.0, "u_on": True})
+    assert [p["value"] for p in points] == pytest.approx([1.5] + 7 * [0.5], rel=0.1)
+
+
+def test_table_of_soft_contacts_has_the_effect_of_u_alone():
+    soft = importlib.import_module("soft_contact")
+    rows = _rows(**{"force/max": (100.0, 60.0, 90.0), "fell": (0.0, 0.0, 0.0)})
+    rows = [row | {"task/spring/final": 0.0, "fell": False} for row in rows]
+    soft.SPRINGS = soft.SPRINGS[:1]
+    (line,) = soft.lines(rows)
+    cells = [cell.split(" [")[0].strip() for cell in line.strip("|").split("|")]
+    expected = [
+        "pull, 5 N/m",
+        "0.16",
+        "104 N",
+        "-39%",
+        "-10%",
+        "-29%",
+        "0%",
+        "0%",
+        "0%",
+    ]
+    assert cells == expected

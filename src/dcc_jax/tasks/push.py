@@ -61,6 +61,8 @@ class Push(Task):
     """Least and greatest speed of the ball at the release, m/s (Sec. 5.2)."""
     distance: float = 0.8
     """Distance of the ball from the root at the release, m."""
+    floats: bool = False
+    """The ball has no weight: a heavy, slow one is an obstacle that presses."""
 
     def quiet(self) -> Push:
         """Nobody throws."""
@@ -68,7 +70,9 @@ class Push(Task):
 
     def extend(self, spec: mujoco.MjSpec) -> None:
         """A ball that touches the character's trunk, head and upper arms."""
-        ball = spec.worldbody.add_body(name="ball", pos=list(AWAY))
+        ball = spec.worldbody.add_body(
+            name="ball", pos=list(AWAY), gravcomp=float(self.floats)
+        )
         slide = mujoco.mjtJoint.mjJNT_SLIDE
         for name, axis in zip(("ball", "ball_y", "ball_z"), np.eye(3), strict=True):
             ball.add_joint(name=name, type=slide, axis=axis)
@@ -116,7 +120,8 @@ class Push(Task):
         flight = (self.distance - self.radius - 0.1) / speed
         start = jnp.append(root, height) + self.distance * away
         # It rises by as much as gravity takes until it arrives.
-        velocity = -speed * away + jnp.append(drift, 0.5 * GRAVITY * flight)
+        rise = 0.0 if self.floats else 0.5 * GRAVITY * flight
+        velocity = -speed * away + jnp.append(drift, rise)
         q_adr, v_adr = scene.address("ball")
         return dataclasses.replace(
             body,
