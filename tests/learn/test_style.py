@@ -115,3 +115,10 @@ def test_speed_and_turn_count_as_the_constants_say():
     ):
         gap = pair_coordinates(*pair, DT) - standing
         assert float(jnp.linalg.norm(gap)) == pytest.approx(expected, rel=1e-4)
+
+
+def test_floor_is_the_distance_of_other_pairs_of_the_clips(reference):
+    floor = style.floor(Toy(), reference, 400)
+    other = jnp.mean(style.nearest(reference, _clip_pairs(7, 400)))
+    assert float(floor) == pytest.approx(float(other), rel=0.2)
+    assert float(floor) > 1e-3

@@ -95,7 +95,16 @@ def of_running(environment: Posed, running: Running) -> dict[str, Array]:
     env = running.env
     points = environment.style_coordinates(env.previous_features, env.features)
     weight = (running.steps > 0).astype(points.dtype)
-    return measure(make_reference(environment), points, weight)
+    reference = make_reference(environment)
+    return measure(reference, points, weight) | {
+        "style/floor": floor(environment, reference)
+    }
+
+
+def floor(environment: Posed, reference: Reference, count: int = 512) -> Array:
+    """`style/nearest` [] in m of other pairs of the clips: nothing comes nearer."""
+    s, s_next, _ = environment.expert_pairs(jax.random.key(_SEED + 1), count)
+    return jnp.mean(nearest(reference, environment.style_coordinates(s, s_next)))
 
 
 def measure(reference: Reference, points: Array, weight: Array) -> dict[str, Array]:

@@ -12,6 +12,7 @@ from tyro.conf import Positional, arg
 
 from dcc_jax import command
 from dcc_jax.training import logs
+from dcc_jax.training.verdict import verdict
 
 PROGRAM = "dcc_jax.curves"
 PANELS = {
@@ -19,7 +20,7 @@ PANELS = {
     "control steps of an episode": ("episode/length",),
     "share of episodes that fall": ("episode/fall_rate",),
     "discriminator: share judged right": ("disc/accuracy_real", "disc/accuracy_fake"),
-    "distance to the clips (m)": ("style/nearest", "style/frechet"),
+    "distance to the clips (m)": ("style/nearest", "style/frechet", "style/floor"),
     "torque (RMS, N m)": ("env/torque_rms",),
     "KL divergence of an update": ("ppo/kl",),
     "tuples per second": ("tuples_per_second",),
@@ -53,7 +54,8 @@ def draw(run_dirs: Sequence[Path], out: Path) -> None:
         axes.set_xlabel("M tuples")
         if axes.lines and (len(names) > 1 or len(runs) > 1):
             axes.legend(fontsize=7)
-    figure.suptitle(", ".join(runs))
+    said = {name: verdict(rows) for name, rows in runs.items()}
+    figure.suptitle("\n".join(": ".join(filter(None, pair)) for pair in said.items()))
     figure.savefig(out, dpi=100)
     plt.close(figure)
 

@@ -20,6 +20,7 @@ from dcc_jax.learn.state import TrainState, UpdateReport
 from dcc_jax.training import checkpoint, folder, logs
 from dcc_jax.training.folder import RunError, default_run_dir
 from dcc_jax.training.stop import StopSignal
+from dcc_jax.training.verdict import verdict
 
 _MAX_DUMPS = 20
 
@@ -228,9 +229,12 @@ def _finish(
         )
     else:
         say(f"finished after update {done}: {run.run_dir}")
+    metrics = logs.read(run.run_dir)
+    if said := verdict(metrics):
+        say(said)
     return TrainResult(
         params=_policy(jax.device_get(state)),
-        metrics=logs.read(run.run_dir),
+        metrics=metrics,
         run_dir=run.run_dir,
         finished=not stop.name,
     )

@@ -1,0 +1,49 @@
+"""What the numbers of a training say, in a sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from statistics import fmean
+
+WON = 1.6
+"""Margin of the discriminator's mean scores, of 2 at most, from which on its reward is
+nearly the same whatever the policy does."""
+WINDOW = 3  # measurements that are averaged
+CHANGE = 0.03  # share by which their mean has to change
+
+
+def verdict(rows: Sequence[dict[str, float]]) -> str:
+    """How far the motion is from its clips, whether that still changes, and whether the
+    discriminator still teaches.
+
+    Args:
+        rows: the metrics of a run, an entry an update; see `logs.read`.
+
+    Returns:
+        A sentence; an empty one where the style was not measured yet.
+    """
+    measured = [row for row in rows if row.get("style/floor")]
+    if not measured:
+        return ""
+    away = [row["style/nearest"] / row["style/floor"] for row in measured]
+    text = f"the motion is {away[-1]:.1f} times the floor away from its clips"
+    text += f" ({1e3 * measured[-1]['style/nearest']:.0f} mm)" + _trend(away)
+    margin = [row["disc/margin"] for row in rows[-50:] if "disc/margin" in row]
+    if margin and fmean(margin) > WON:
+        text += (
+            f"; the discriminator has won (it scores clips {fmean(margin):.1f} of 2 "
+            "higher) and teaches little: raise disc.instance_noise or "
+            "disc.gradient_penalty"
+        )
+    return text
+
+
+def _trend(away: Sequence[float]) -> str:
+    if len(away) < 2 * WINDOW:
+        return ""
+    before, after = fmean(away[-2 * WINDOW : -WINDOW]), fmean(away[-WINDOW:])
+    if after < (1.0 - CHANGE) * before:
+        return ", still falling"
+    if after > (1.0 + CHANGE) * before:
+        return ", rising"
+    return ", no longer falling"
