@@ -27,7 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dcc_jax.physics import arrowhead, native
+from dcc_jax.physics import arrowhead
 from dcc_jax.physics.sparsity import Arrow
 
 Array = jax.Array
@@ -59,13 +59,10 @@ def newton(
         iterations: the most Newton iterations; the batch goes on until its last
             environment has converged, those that have stay as they are.
     """
-    given = mass, smooth, rows.J, rows.D, rows.aref, start
-    if native.available() and mass.dtype == jnp.float32:
-        return native.newton(shape, rows.num_equality, iterations, *given)
     solve = _batch_last(
         functools.partial(_newton, shape, rows.num_equality, iterations)
     )
-    return solve(*given)
+    return solve(mass, smooth, rows.J, rows.D, rows.aref, start)
 
 
 def solve_mass(shape: Arrow, mass: Array, less: np.ndarray, forces: Array) -> Array:

@@ -1,12 +1,15 @@
-// The contact solver on a CPU: `contact_solver.newton`, a vector register of environments
+// Mass matrix, contact rows and contact solver on a CPU, a vector register of environments
 // at a time.
 //
-// The algorithm, its stopping rule and its order of limbs and core are those of
+// M and the rows of the contacts are made here, in the parts in which the solver wants
+// them: written out they are 4,500 numbers an environment, of which most are zero. The
+// algorithm, its stopping rule and its order of limbs and core are those of
 // contact_solver.py and arrowhead.py, which are the reference. Here a number is a vector,
 // a lane an environment. What a block of them needs stays in the CPU's cache through all
 // iterations, and rows that are inactive in all of them are passed over.
 
 #include <algorithm>
+#include <array>
 #include <cstdint>
 #include <vector>
 
@@ -49,19 +52,45 @@ struct Part {
   int size() const { return static_cast<int>(dofs.size()); }
 };
 
+// What the kernel is given: one row an environment, but for `iterations`.
+struct Given {
+  const float* inertia;   // [nbody, 10] of the composite bodies (MJX's crb)
+  const float* motion;    // [nv, 6] axes of motion, angular then linear (MJX's cdof)
+  const float* center;    // [nbody, 3] that the linear parts are about
+  const float* velocity;  // [nv]
+  const float* smooth;    // [nv]
+  const float* start;     // [nv]
+  const float* J;         // [E, nv] rows of equalities and limits
+  const float* D;         // [E + C] of those rows, then of the contacts
+  const float* aref;      // [E + C] likewise; of a contact without its damping
+  const float* frame;     // [C, 9] normal and two tangents; zero where it is apart
+  const float* point;     // [C, 3]
+  const float* friction;  // [C, 2]
+  const float* damping;   // [C]
+};
+
 // One block of environments. `parts` ends with the core.
 struct Block {
-  int nv, num_rows, num_equality, iterations;
+  int nv, num_rows, num_equality, num_given, num_bodies, iterations;
   std::vector<Part> parts;
+  std::vector<int> parent, body, root;  // [nv] of a degree of freedom
+  std::vector<float> armature;          // [nv]
+  std::vector<int8_t> sign;             // [C * nv] how a dof moves a contact apart
+  std::vector<V> motion, momentum;      // [nv * 6]
   std::vector<V> D, aref, residual, slope, weight;
-  std::vector<V> smooth, x, mass_x, search, mass_search, y;
+  std::vector<V> velocity, smooth, x, mass_x, search, mass_search, y;
 
-  explicit Block(ffi::Span<const int32_t> packed, int iterations);
-  void load(const float* mass, const float* smooth, const float* J, const float* D,
-            const float* aref, const float* start, const int* env);
+  Block(ffi::Span<const int32_t> packed, ffi::Span<const float> armature,
+        int iterations);
+  void load(const Given& given, const int* env);
   void solve(const int* env, int count, float* qacc, float* force);
 
  private:
+  int num_contacts() const { return (num_rows - num_given) / 4; }
+  bool moves(int dof, int last) const;
+  void load_masses(const Given& given, const int* env);
+  void load_rows(const Given& given, const int* env);
+  void load_contact(Part& part, int r, const Given& given, const int* env);
   void times_mass(const std::vector<V>& in, std::vector<V>& out) const;
   void times_rows(const std::vector<V>& in, std::vector<V>& out) const;
   I active(int row, V residual) const;
@@ -70,11 +99,18 @@ struct Block {
   V line_search(V gauss_1, V gauss_2) const;
 };
 
-Block::Block(ffi::Span<const int32_t> packed, int iterations) : iterations(iterations) {
+Block::Block(ffi::Span<const int32_t> packed, ffi::Span<const float> diagonal,
+             int iterations)
+    : iterations(iterations), armature(diagonal.begin(), diagonal.end()) {
   const int32_t* at = packed.begin();
-  nv = *at++;
-  num_rows = *at++;
-  num_equality = *at++;
+  for (int* number : {&nv, &num_rows, &num_equality, &num_given, &num_bodies})
+    *number = *at++;
+  for (auto* of_dof : {&parent, &body, &root}) {
+    of_dof->assign(at, at + nv);
+    at += nv;
+  }
+  for (int c = 0; c < num_contacts(); ++c, at += 2)
+    for (int i = 0; i < nv; ++i) sign.push_back(moves(i, at[1]) - moves(i, at[0]));
   const int count = *at++;
   for (int p = 0; p < count; ++p) {
     Part part;
@@ -91,8 +127,16 @@ Block::Block(ffi::Span<const int32_t> packed, int iterations) : iterations(itera
     part.J.resize(rows * size);
     parts.push_back(std::move(part));
   }
+  for (auto* v : {&motion, &momentum}) v->resize(nv * 6);
   for (auto* v : {&D, &aref, &residual, &slope, &weight}) v->resize(num_rows);
-  for (auto* v : {&smooth, &x, &mass_x, &search, &mass_search, &y}) v->resize(nv);
+  for (auto* v : {&velocity, &smooth, &x, &mass_x, &search, &mass_search, &y})
+    v->resize(nv);
+}
+
+// Whether a body moves with a degree of freedom, by the last one that moves it.
+bool Block::moves(int dof, int last) const {
+  while (last > dof) last = parent[last];
+  return last == dof;
 }
 
 // A value of each environment; they lie `stride` apart in memory.
@@ -102,30 +146,124 @@ inline V gather(const float* from, int64_t stride, const int* env) {
   return out;
 }
 
-void Block::load(const float* mass, const float* smooth_in, const float* J,
-                 const float* D_in, const float* aref_in, const float* start,
-                 const int* env) {
-  const int64_t square = int64_t(nv) * nv, wide = int64_t(num_rows) * nv;
+template <int N>
+inline std::array<V, N> gather(const float* from, int64_t stride, const int* env) {
+  std::array<V, N> out;
+  for (int i = 0; i < N; ++i) out[i] = gather(from + i, stride, env);
+  return out;
+}
+
+inline std::array<V, 3> cross(const V* a, const V* b) {
+  return {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2],
+          a[0] * b[1] - a[1] * b[0]};
+}
+
+// The momentum of a body with the spatial inertia I that moves along m.
+inline void times_inertia(const std::array<V, 10>& I, const V* m, V* out) {
+  const V* offset = &I[6];
+  const auto tilt = cross(offset, m + 3), lift = cross(offset, m);
+  out[0] = I[0] * m[0] + I[3] * m[1] + I[4] * m[2] + tilt[0];
+  out[1] = I[3] * m[0] + I[1] * m[1] + I[5] * m[2] + tilt[1];
+  out[2] = I[4] * m[0] + I[5] * m[1] + I[2] * m[2] + tilt[2];
+  for (int k = 0; k < 3; ++k) out[3 + k] = I[9] * m[3 + k] - lift[k];
+}
+
+void Block::load(const Given& given, const int* env) {
+  for (int i = 0; i < nv; ++i) {
+    velocity[i] = gather(given.velocity + i, nv, env);
+    smooth[i] = gather(given.smooth + i, nv, env);
+    x[i] = gather(given.start + i, nv, env);
+  }
+  load_masses(given, env);
+  load_rows(given, env);
+}
+
+// M_ij = momentum of i's composite body along i, times the motion of its ancestor j.
+void Block::load_masses(const Given& given, const int* env) {
+  std::array<V, 10> inertia;
+  for (int i = 0; i < nv; ++i) {
+    for (int k = 0; k < 6; ++k)
+      motion[6 * i + k] = gather(given.motion + 6 * i + k, 6 * nv, env);
+    if (!i || body[i] != body[i - 1])
+      inertia = gather<10>(given.inertia + 10 * body[i], 10 * num_bodies, env);
+    times_inertia(inertia, &motion[6 * i], &momentum[6 * i]);
+  }
   for (Part& part : parts) {
     const int size = part.size();
     for (int i = 0; i < size; ++i) {
       // What couples the core's own unknowns is left to the core.
-      for (int j = 0; j <= std::min(i, part.own - 1); ++j)
-        part.mass[i * size + j] =
-            gather(mass + int64_t(part.dofs[i]) * nv + part.dofs[j], square, env);
+      for (int j = 0; j <= std::min(i, part.own - 1); ++j) {
+        const int high = std::max(part.dofs[i], part.dofs[j]);
+        const int low = std::min(part.dofs[i], part.dofs[j]);
+        V sum{};
+        if (moves(low, high))
+          for (int k = 0; k < 6; ++k) sum += momentum[6 * high + k] * motion[6 * low + k];
+        part.mass[i * size + j] = i == j ? sum + armature[high] : sum;
+      }
     }
-    for (size_t r = 0; r < part.rows.size(); ++r)
-      for (int i = 0; i < size; ++i)
-        part.J[r * size + i] =
-            gather(J + int64_t(part.rows[r]) * nv + part.dofs[i], wide, env);
   }
+}
+
+void Block::load_rows(const Given& given, const int* env) {
+  const int total = num_given + num_contacts();
   for (int r = 0; r < num_rows; ++r) {
-    D[r] = gather(D_in + r, num_rows, env);
-    aref[r] = gather(aref_in + r, num_rows, env);
+    const int at = r < num_given ? r : num_given + (r - num_given) / 4;
+    D[r] = gather(given.D + at, total, env);
   }
-  for (int i = 0; i < nv; ++i) {
-    smooth[i] = gather(smooth_in + i, nv, env);
-    x[i] = gather(start + i, nv, env);
+  for (Part& part : parts) {
+    const int size = part.size();
+    for (size_t r = 0; r < part.rows.size(); ++r) {
+      const int row = part.rows[r];
+      if (row >= num_given) {
+        if ((row - num_given) % 4 == 0) load_contact(part, r, given, env);
+        continue;
+      }
+      for (int i = 0; i < size; ++i)
+        part.J[r * size + i] = gather(given.J + int64_t(row) * nv + part.dofs[i],
+                                      int64_t(num_given) * nv, env);
+    }
+  }
+  times_rows(velocity, aref);
+  for (int r = 0; r < num_rows; ++r) {
+    const int c = (r - num_given) / 4;
+    if (r < num_given)
+      aref[r] = gather(given.aref + r, total, env);
+    else
+      aref[r] = gather(given.aref + num_given + c, total, env) -
+                gather(given.damping + c, num_contacts(), env) * aref[r];
+  }
+}
+
+// The four edges of a contact's pyramid, normal +- friction * tangent: rows r to r + 3.
+void Block::load_contact(Part& part, int r, const Given& given, const int* env) {
+  const int c = (part.rows[r] - num_given) / 4, size = part.size();
+  const int64_t count = num_contacts();
+  const auto frame = gather<9>(given.frame + 9 * c, 9 * count, env);
+  const auto point = gather<3>(given.point + 3 * c, 3 * count, env);
+  const auto friction = gather<2>(given.friction + 2 * c, 2 * count, env);
+  V* J = &part.J[r * size];
+  std::array<V, 3> offset;
+  int about = -1;
+  for (int i = 0; i < size; ++i) {
+    const int dof = part.dofs[i];
+    const int apart = sign[c * nv + dof];
+    if (apart && root[dof] != about) {
+      about = root[dof];
+      const auto center = gather<3>(given.center + 3 * about, 3 * num_bodies, env);
+      for (int k = 0; k < 3; ++k) offset[k] = point[k] - center[k];
+    }
+    std::array<V, 3> edge{};  // how the dof moves along normal and tangents
+    if (apart) {
+      auto speed = cross(&motion[6 * dof], offset.data());
+      for (int k = 0; k < 3; ++k) speed[k] += motion[6 * dof + 3 + k];
+      for (int k = 0; k < 3; ++k)
+        edge[k] = float(apart) * (frame[3 * k] * speed[0] + frame[3 * k + 1] * speed[1] +
+                                  frame[3 * k + 2] * speed[2]);
+    }
+    for (int t = 0; t < 2; ++t) {
+      J[2 * t * size + i] = edge[0] + friction[t] * edge[1 + t];
+      J[(2 * t + 1) * size + i] = edge[0] - friction[t] * edge[1 + t];
+    }
   }
 }
 
@@ -285,22 +423,28 @@ void Block::solve(const int* env, int count, float* qacc, float* force) {
   }
 }
 
-ffi::Error Newton(ffi::Buffer<ffi::F32> mass, ffi::Buffer<ffi::F32> smooth,
-                  ffi::Buffer<ffi::F32> J, ffi::Buffer<ffi::F32> D,
-                  ffi::Buffer<ffi::F32> aref, ffi::Buffer<ffi::F32> start,
-                  ffi::Buffer<ffi::S32> most,
-                  ffi::ResultBuffer<ffi::F32> qacc, ffi::ResultBuffer<ffi::F32> force,
-                  ffi::Span<const int32_t> structure) {
+using Floats = ffi::Buffer<ffi::F32>;
+
+ffi::Error Newton(Floats inertia, Floats motion, Floats center, Floats velocity,
+                  Floats smooth, Floats start, Floats J, Floats D, Floats aref,
+                  Floats frame, Floats point, Floats friction, Floats damping,
+                  ffi::Buffer<ffi::S32> most, ffi::ResultBuffer<ffi::F32> qacc,
+                  ffi::ResultBuffer<ffi::F32> force,
+                  ffi::Span<const int32_t> structure, ffi::Span<const float> armature) {
+  const Given given{inertia.typed_data(),  motion.typed_data(),   center.typed_data(),
+                    velocity.typed_data(), smooth.typed_data(),   start.typed_data(),
+                    J.typed_data(),        D.typed_data(),        aref.typed_data(),
+                    frame.typed_data(),    point.typed_data(),    friction.typed_data(),
+                    damping.typed_data()};
   // The same number for every environment of a batch.
-  Block block(structure, most.typed_data()[0]);
+  Block block(structure, armature, most.typed_data()[0]);
   const int64_t batch = smooth.element_count() / block.nv;
   for (int64_t first = 0; first < batch; first += kLanes) {
     int env[kLanes];
     const int count = static_cast<int>(std::min<int64_t>(kLanes, batch - first));
     for (int l = 0; l < kLanes; ++l)
       env[l] = static_cast<int>(first) + std::min(l, count - 1);
-    block.load(mass.typed_data(), smooth.typed_data(), J.typed_data(), D.typed_data(),
-               aref.typed_data(), start.typed_data(), env);
+    block.load(given, env);
     block.solve(env, count, qacc->typed_data(), force->typed_data());
   }
   return ffi::Error::Success();
@@ -311,13 +455,21 @@ ffi::Error Newton(ffi::Buffer<ffi::F32> mass, ffi::Buffer<ffi::F32> smooth,
 XLA_FFI_DEFINE_HANDLER_SYMBOL(
     dcc_newton, Newton,
     ffi::Ffi::Bind()
-        .Arg<ffi::Buffer<ffi::F32>>()
-        .Arg<ffi::Buffer<ffi::F32>>()
-        .Arg<ffi::Buffer<ffi::F32>>()
-        .Arg<ffi::Buffer<ffi::F32>>()
-        .Arg<ffi::Buffer<ffi::F32>>()
-        .Arg<ffi::Buffer<ffi::F32>>()
+        .Arg<Floats>()
+        .Arg<Floats>()
+        .Arg<Floats>()
+        .Arg<Floats>()
+        .Arg<Floats>()
+        .Arg<Floats>()
+        .Arg<Floats>()
+        .Arg<Floats>()
+        .Arg<Floats>()
+        .Arg<Floats>()
+        .Arg<Floats>()
+        .Arg<Floats>()
+        .Arg<Floats>()
         .Arg<ffi::Buffer<ffi::S32>>()
-        .Ret<ffi::Buffer<ffi::F32>>()
-        .Ret<ffi::Buffer<ffi::F32>>()
-        .Attr<ffi::Span<const int32_t>>("structure"));
+        .Ret<Floats>()
+        .Ret<Floats>()
+        .Attr<ffi::Span<const int32_t>>("structure")
+        .Attr<ffi::Span<const float>>("armature"));

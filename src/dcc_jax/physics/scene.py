@@ -5,9 +5,7 @@ Letters: C contacts, R constraint rows, nv degrees of freedom, all of one scene.
 
 from __future__ import annotations
 
-import contextlib
 import copy
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -17,12 +15,10 @@ import mujoco
 import numpy as np
 
 from dcc_jax.character import Character
+from dcc_jax.physics.native import Layout
+from dcc_jax.physics.quiet_mjx import mjx
 from dcc_jax.physics.sparsity import Arrow, arrow
 from dcc_jax.quat import Coordinates
-
-with contextlib.redirect_stdout(io.StringIO()):
-    # It prints that Warp is missing, which only CUDA could use.
-    from mujoco import mjx
 
 Array = jax.Array
 
@@ -51,6 +47,7 @@ class Scene:
     mjx_model: mjx.Model  # on the device; constants of the compiled program
     template: mjx.Data  # constant: every step starts from it, only `State` is carried
     contact_bodies: np.ndarray  # [C, 2] body ids; the force acts on the second
+    layout: Layout  # of degrees of freedom and rows, for the kernel
     arrow: Arrow  # where the matrices of the contact solver can be non-zero
     mass_arrow: Arrow  # where the mass matrix alone can
 
@@ -150,6 +147,7 @@ def make_scene(
         mjx_model=mjx_model,
         template=template,
         contact_bodies=contact_bodies,
+        layout=Layout.of(model, contact_bodies, template._impl.ne),
         arrow=arrow(model, _row_pattern(model, contact_bodies)),
         mass_arrow=arrow(model, np.zeros((0, model.nv), bool)),
     )

@@ -23,8 +23,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from dcc_jax import quat
+from dcc_jax.physics import native
 from dcc_jax.physics.contact_solver import Rows, newton, solve_mass
-from dcc_jax.physics.scene import Scene, mjx
+from dcc_jax.physics.quiet_mjx import mjx
+from dcc_jax.physics.scene import Scene
 
 Array = jax.Array
 
@@ -91,7 +93,7 @@ def default_world(scene: Scene) -> World:
 
 
 def kinematics(scene: Scene, state: State, world: World | None = None) -> Kinematics:
-    """Poses, motion axes, mass matrix, contacts and constraint rows of a state."""
+    """Poses, motion axes, composite inertias, mass matrix and contacts of a state."""
     model = scene.mjx_model
     data = scene.template.replace(qpos=state.qpos, qvel=state.qvel)
     if world is not None:
@@ -104,7 +106,6 @@ def kinematics(scene: Scene, state: State, world: World | None = None) -> Kinema
     data = mjx.com_pos(model, data)
     data = mjx.crb(model, data)
     data = mjx.collision(model, data)
-    data = mjx.make_constraint(model, data)
     return Kinematics(data=data)
 
 
@@ -125,22 +126,29 @@ def solve(scene: Scene, kin: Kinematics, state: State, qfrc: Array) -> Solution:
     data = mjx.passive(model, data)
     data = mjx.rne(model, data)
     smooth = qfrc + data.qfrc_passive - data.qfrc_bias
-    rows = Rows(
-        J=data._impl.efc_J,
-        D=data._impl.efc_D,
-        aref=data._impl.efc_aref,
-        num_equality=data._impl.ne,
-    )
-    mass = mjx.full_m(model, data)
-    qacc, force = newton(
-        scene.arrow, mass, smooth, rows, state.qacc, scene.newton_iterations
-    )
+    if native.available() and smooth.dtype == jnp.float32:
+        given = native.problem(model, data, smooth, state.qacc)
+        qacc, force = native.newton(
+            scene.arrow, scene.layout, given, scene.newton_iterations
+        )
+    else:
+        data = mjx.make_constraint(model, data)
+        rows = Rows(
+            J=data._impl.efc_J,
+            D=data._impl.efc_D,
+            aref=data._impl.efc_aref,
+            num_equality=data._impl.ne,
+        )
+        mass = mjx.full_m(model, data)
+        qacc, force = newton(
+            scene.arrow, mass, smooth, rows, state.qacc, scene.newton_iterations
+        )
     contact_force_w, contact_point_w = _contact_forces(data, force)
     return Solution(
         qacc=qacc,
         contact_force_w=contact_force_w,
         contact_point_w=contact_point_w,
-        equality_force=force[: data._impl.ne],
+        equality_force=force[: scene.layout.num_equality],
     )
 
 
