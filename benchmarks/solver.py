@@ -4,8 +4,9 @@
 
 Both solve the contact problems of characters at random moments of their episodes'
 beginnings, sunk in by up to 2 cm, moving and pushed at random, from accelerations of
-zero: more iterations than a training needs. One core. It prints microseconds an
-environment by the number of iterations, and how far the two are apart.
+zero: more iterations than a training needs. Mass matrix and rows are made on the way.
+One core. It prints microseconds an environment by the number of iterations, and how far
+the two are apart.
 """
 
 from __future__ import annotations
@@ -23,22 +24,24 @@ if __name__ == "__main__":
 import jax
 import jax.numpy as jnp
 import numpy as np
-from mujoco import mjx
 
 from dcc_jax import physics, tasks
 from dcc_jax.config import make_config
 from dcc_jax.env.environment import Environment
 from dcc_jax.physics import contact_solver, native
+from dcc_jax.physics.quiet_mjx import mjx
+
+Array = jax.Array
 
 ITERATIONS = (1, 2, 4, 8)
 ROUNDS = 40
 
 
-def problems(environment: Environment, count: int) -> tuple[jax.Array, ...]:
-    """M, smooth forces, J, D, aref and start of `count` environments."""
+def problems(environment: Environment, count: int) -> tuple[mjx.Data, Array, Array]:
+    """States, smooth forces and start of `count` environments."""
     scene = environment.scene
 
-    def one(key: jax.Array) -> tuple[jax.Array, ...]:
+    def one(key: Array) -> tuple[mjx.Data, Array, Array]:
         reset_key, *keys = jax.random.split(key, 4)
         body = environment.reset(reset_key).body
         sunk = 0.02 * jax.random.uniform(keys[0])
@@ -52,28 +55,27 @@ def problems(environment: Environment, count: int) -> tuple[jax.Array, ...]:
             data = stage(scene.mjx_model, data)
         pushed = 20.0 * jax.random.normal(keys[2], body.qvel.shape)
         smooth = pushed + data.qfrc_passive - data.qfrc_bias
-        rows = data._impl.efc_J, data._impl.efc_D, data._impl.efc_aref
-        mass = mjx.full_m(scene.mjx_model, data)
-        return mass, smooth, *rows, jnp.zeros_like(body.qvel)
+        return data, smooth, jnp.zeros_like(body.qvel)
 
     return jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(0), count))
 
 
-def solvers(
-    environment: Environment, equalities: int, iterations: int
-) -> dict[str, Callable]:
+def solvers(environment: Environment, iterations: int) -> dict[str, Callable]:
     """Both forms, compiled for a batch."""
-    given = environment.scene.arrow, equalities, iterations
+    scene = environment.scene
+    model = scene.mjx_model
 
-    def in_jax(*arguments):
-        return contact_solver._batch_last(
-            lambda *x: contact_solver._newton(*given, *x)
-        )(*arguments)
+    def kernel(data: mjx.Data, smooth: Array, start: Array) -> tuple[Array, Array]:
+        given = native.problem(model, data, smooth, start)
+        return native.newton(scene.arrow, scene.layout, given, iterations)
 
-    return {
-        "kernel": jax.jit(jax.vmap(lambda *x: native.newton(*given, *x))),
-        "JAX": jax.jit(jax.vmap(in_jax)),
-    }
+    def in_jax(data: mjx.Data, smooth: Array, start: Array) -> tuple[Array, Array]:
+        data = mjx.make_constraint(model, mjx.crb(model, data))
+        mass, made, equalities = mjx.full_m(model, data), data._impl, data._impl.ne
+        rows = contact_solver.Rows(made.efc_J, made.efc_D, made.efc_aref, equalities)
+        return contact_solver.newton(scene.arrow, mass, smooth, rows, start, iterations)
+
+    return {"kernel": jax.jit(jax.vmap(kernel)), "JAX": jax.jit(jax.vmap(in_jax))}
 
 
 def main() -> None:
@@ -88,10 +90,9 @@ def main() -> None:
     config = make_config(options.task)
     environment = tasks.make_environment(config.task, config.env)
     given = problems(environment, options.environments)
-    equalities = int(environment.scene.template._impl.ne)
     print("iterations  kernel us  JAX us  ratio  largest difference of a force")
     for most in ITERATIONS:
-        both = solvers(environment, equalities, most)
+        both = solvers(environment, most)
         forces = {name: np.asarray(run(*given)[1]) for name, run in both.items()}
         seconds: dict[str, list[float]] = {name: [] for name in both}
         for _ in range(ROUNDS):
