@@ -2,10 +2,9 @@
 
     python benchmarks/viewer.py [POLICY ...] [--minutes 1]
 
-Each policy in a fresh process: seconds from the command to the first control step, ms of
-a control step (33.3 are real time), the largest memory, and how much it grew over the
-last nine tenths of that many minutes of the character's time. No browser; a page adds
-what `docs/viewer.md` says.
+Each policy in a fresh process: seconds from the command to the first control step, ms
+of a control step (33.3 are real time), the largest memory, and how much it grew over
+the last nine tenths of that many minutes of the character's time. No browser.
 """
 
 from __future__ import annotations

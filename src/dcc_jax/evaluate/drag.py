@@ -26,7 +26,7 @@ from dcc_jax.env import features
 from dcc_jax.env.environment import Environment
 from dcc_jax.evaluate import bootstrap
 from dcc_jax.evaluate.bootstrap import Interval
-from dcc_jax.evaluate.dragging import BODIES, Play, Trials, program
+from dcc_jax.evaluate.dragging import BODIES, Dragging, Trials
 from dcc_jax.play.pull import Pulled
 from dcc_jax.play.runs import Run, find_run, make_environment
 
@@ -135,7 +135,7 @@ def execute(
     plan: DragPlan, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> list[Drag]:
     """Drags and measures; `progress` is told levels done and to be done."""
-    play, found = program(plan.environment), []
+    play, found = Dragging(plan.environment), []
     for level in plan.alpha:
         progress(len(found), len(plan.alpha))
         found.append(_measured(plan, level, play))
@@ -152,7 +152,7 @@ def slope(drags: Sequence[Drag], body: str) -> float:
     return float(np.polyfit(expected[good], found[good], 1)[0])
 
 
-def _measured(plan: DragPlan, alpha: float, play: Play) -> Drag:
+def _measured(plan: DragPlan, alpha: float, play: Dragging) -> Drag:
     character, trials = plan.environment.scene.character, plan.trials
     q, ended = play(plan.run, trials, alpha, plan.seed)  # [T, K, 55], [K]
     q = q[-round(AVERAGED * CONTROL_RATE) :]

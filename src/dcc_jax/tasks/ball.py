@@ -61,8 +61,8 @@ class Ball(Task):
         "ppo.sigma_degrees": 3.0,
         "train.warm_start_steps": 0,
     }
-    """With 6 degrees of noise a linear-quadratic regulator loses the ball in 98 % of the
-    trials, with 3 in none (`experiments/linear_feedback.py`). A stand shows nothing
+    """With 6 degrees of noise a linear-quadratic regulator loses the ball in 98 % of
+    the trials, with 3 in none (`experiments/linear_feedback.py`). A stand shows nothing
     that a policy with small weights would not do."""
     camera_distance: ClassVar[float] = 5.0  # the ball is at 2.9 m
     camera_height: ClassVar[float] = 1.4
