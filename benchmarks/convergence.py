@@ -20,11 +20,10 @@ import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
-from dcc_jax import physics  # noqa: E402
+from dcc_jax import physics, tasks  # noqa: E402
 from dcc_jax.config import make_config  # noqa: E402
 from dcc_jax.env.environment import Environment  # noqa: E402
 from dcc_jax.env.state import EnvState  # noqa: E402
-from dcc_jax.training import loop  # noqa: E402
 
 Array = jax.Array
 AT_MOST, CONVERGED = (2, 3, 4, 5, 6, 8), 24
@@ -88,14 +87,15 @@ def measured(environment: Environment, steps: int) -> np.ndarray:
 
 def main() -> None:
     """Parses the arguments, measures, prints."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     default = ["push", "hand-in-hand", "chicken-fight", "door", "ball", "trampoline"]
     parser.add_argument("tasks", nargs="*", default=default, metavar="TASK")
     parser.add_argument("--steps", type=int, default=200, help="control steps (200)")
     args = parser.parse_args()
     print(f"{'at most':15s}" + "".join(f"{n:>9d}" for n in AT_MOST))
     for name in args.tasks:
-        shares = measured(loop.make_environment(make_config(name)), args.steps)
+        config = make_config(name)
+        shares = measured(tasks.make_environment(config.task, config.env), args.steps)
         print(f"{name:15s}" + "".join(f"{s:9.2%}" for s in shares), flush=True)
 
 

@@ -14,12 +14,11 @@ from training import medians, update_of
 
 from dcc_jax import tasks
 from dcc_jax.config import make_config
-from dcc_jax.training import loop
 
 
 def main() -> None:
     """Parses the arguments, measures, prints."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("tasks", nargs="*", default=tasks.TASKS, metavar="TASK")
     parser.add_argument("--preset", default="cpu")
     parser.add_argument("--rounds", type=int, default=5)
@@ -27,7 +26,10 @@ def main() -> None:
     names = ["push", *(name for name in args.tasks if name != "push")]
     configs = {name: make_config(name, args.preset) for name in names}
     seconds = medians(
-        {n: update_of(loop.make_environment(c), c) for n, c in configs.items()},
+        {
+            n: update_of(tasks.make_environment(c.task, c.env), c)
+            for n, c in configs.items()
+        },
         args.rounds,
     )
     print(f"{'task':15s}{'tuples/s':>10s}{'push = 1':>10s}")

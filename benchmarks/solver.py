@@ -79,7 +79,7 @@ def solvers(environment: Environment, iterations: int) -> dict[str, Callable]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--task", choices=tasks.TASKS, default="push")
     parser.add_argument("--environments", type=int, default=128)
     options = parser.parse_args()

@@ -74,10 +74,12 @@ def standing(count: int) -> Start:
         reset_key, qvel_key, step_key = jax.random.split(key, 3)
         qvel = 0.01 * jax.random.normal(qvel_key, (scene.model.nv,))
         state = environment.reset(reset_key)
-        state = state.replace(body=physics.initial_state(scene, qpos0, qvel))
+        state = dataclasses.replace(
+            state, body=physics.initial_state(scene, qpos0, qvel)
+        )
         action = jnp.zeros(environment.action_size)
         carry, plan = environment.begin(step_key, state, action)
-        return carry, plan.replace(pose=qpos0)
+        return carry, dataclasses.replace(plan, pose=qpos0)
 
     carry, plan = jax.jit(jax.vmap(begin))(_keys(count))
     return Start(environment, carry, plan, STANDING_STEPS)

@@ -20,6 +20,7 @@ import resource
 import sys
 import time
 from collections.abc import Callable
+from typing import Any
 
 from dcc_jax import runtime
 
@@ -98,7 +99,7 @@ def row(name: str, numbers: dict[str, float]) -> str:
 
 def arguments() -> argparse.Namespace:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument(
         "--tasks",
         nargs="*",
@@ -127,7 +128,7 @@ def main() -> None:
     rounds, drops = (5, 4) if args.quick else (21, 16)
     per_device = 128 if jax.default_backend() == "cpu" else 8192
     count = per_device * len(jax.devices())
-    report: dict[str, object] = {
+    report: dict[str, Any] = {
         "device": f"{len(jax.devices())} x {jax.devices()[0].device_kind}",
         "machine": f"{platform.machine()}, {THREADS} cores",
         "jax": jax.__version__,
@@ -153,8 +154,8 @@ def main() -> None:
             file=sys.stderr,
         )
         if alone:
-            scene = start.environment.scene
-    report |= {"rates": rates, "landings": landing_errors(scene, drops)}
+            report["landings"] = landing_errors(start.environment.scene, drops)
+    report["rates"] = rates
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
     report["peak_memory_mib"] = memory
     print()

@@ -38,7 +38,7 @@ from jax.sharding import NamedSharding, PartitionSpec  # noqa: E402
 from mujoco import mjx  # noqa: E402
 from states import substep  # noqa: E402
 
-from dcc_jax import physics  # noqa: E402
+from dcc_jax import physics, tasks  # noqa: E402
 from dcc_jax.character import compose_scene, load_character  # noqa: E402
 from dcc_jax.config import Config, make_config  # noqa: E402
 from dcc_jax.control import pd  # noqa: E402
@@ -47,7 +47,6 @@ from dcc_jax.env.environment import Environment  # noqa: E402
 from dcc_jax.env.state import EnvState, Substep  # noqa: E402
 from dcc_jax.learn import learner  # noqa: E402
 from dcc_jax.learn.update import chunk_size  # noqa: E402
-from dcc_jax.training import loop  # noqa: E402
 
 Array = jax.Array
 
@@ -89,8 +88,12 @@ def physics_alone(environment: Environment, state: EnvState) -> EnvState:
 
     steps = environment.config.control_steps
     end, _ = jax.lax.scan(one, start, None, length=steps)
-    return state.replace(
-        body=end.body, displacement=end.displacement, task=end.task, time=end.time
+    return dataclasses.replace(
+        state,
+        body=end.body,
+        displacement=end.displacement,
+        task=end.task,
+        time=end.time,
     )
 
 
@@ -147,7 +150,7 @@ def medians(variants: dict[str, Callable[[], None]], rounds: int) -> dict[str, f
 
 def split(config: Config, rounds: int) -> dict[str, float]:
     """Tuples per second end to end, and the share of each part."""
-    environment = loop.make_environment(config)
+    environment = tasks.make_environment(config.task, config.env)
     epochs, minibatches = config.ppo.epochs, config.disc.minibatches
     seconds = medians(
         {
@@ -204,8 +207,11 @@ def first_update(config: Config, cache: str) -> float:
 
 def brax_rate(config: Config) -> float:
     """Tuples per second of Brax's PPO on `mjx.step` of the same character."""
-    from brax.envs.base import Env, State
-    from brax.training.agents.ppo import networks, train
+    from brax.envs.base import Env, State  # pyright: ignore[reportMissingImports]
+    from brax.training.agents.ppo import (  # pyright: ignore[reportMissingImports]
+        networks,
+        train,
+    )
 
     character = load_character()
     scene = physics.make_scene(
@@ -246,7 +252,8 @@ def brax_rate(config: Config) -> float:
 
             data, _ = jax.lax.scan(substep, state.pipeline_state, None, length=substeps)
             up = data.qpos[2] > config.env.fall_height
-            return state.replace(
+            return dataclasses.replace(
+                state,
                 pipeline_state=data,
                 obs=jnp.concatenate([data.qpos, data.qvel]),
                 reward=jnp.exp(-jnp.abs(data.qpos[2] - 0.9)),
@@ -288,7 +295,7 @@ def brax_rate(config: Config) -> float:
 
 def main() -> None:
     """Parses the arguments, measures, prints, writes."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--task", default="push")
     parser.add_argument("--preset", default="cpu")
     parser.add_argument("--rounds", type=int, default=5)

@@ -115,7 +115,7 @@ def outcomes(film: Film) -> np.ndarray:
 def bumps(film: Film, n: int) -> list[tuple[int, int]]:
     """Control steps [begin, end) of the bumps of a match while both are up."""
     down = film.fallen[:, n].any(axis=-1)
-    last = int(down.argmax()) if down.any() else len(down)
+    last = int(down.argmax()) if down.any() else len(film.fallen)
     touching = np.flatnonzero(np.any(film.impulse[:last, n, 0] != 0.0, axis=-1))
     if touching.size == 0:
         return []
@@ -236,9 +236,9 @@ def _draw_momenta(axes: Axes, rows: list[dict]) -> None:
         before, after = (
             paired.column(rows, f"momentum_{x}", **arm) for x in ("before", "after")
         )
-        face = {} if arm["u_on"] else {"markerfacecolor": "none"}
         colour = paired.line(arm, levels)["color"]
-        axes.plot(before, after, ".", alpha=0.5, color=colour, **face)
+        fill = colour if arm["u_on"] else "none"
+        axes.plot(before, after, ".", alpha=0.5, color=colour, markerfacecolor=fill)
     axes.axline((0.0, 0.0), slope=1.0, color="0.5", lw=0.8)
     axes.set(xlabel="before", ylabel="after", aspect="equal")
     axes.set_title("momentum of both along a bump (N s)")

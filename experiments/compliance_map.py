@@ -23,6 +23,7 @@ import argparse
 import dataclasses
 import json
 from pathlib import Path
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +37,7 @@ import matplotlib.pyplot as plt
 from dcc_jax import physics, quat
 from dcc_jax.character import BODIES, Character, compose_scene, load_character
 from dcc_jax.control import compliance, pd
-from dcc_jax.control.config import LAWS, ComplianceConfig
+from dcc_jax.control.config import LAWS, ComplianceConfig, Law
 
 PD_ALONE = "PD alone"
 DIRECTIONS = np.concatenate([np.eye(3), -np.eye(3)])
@@ -71,18 +72,20 @@ def pushed(scene: physics.Scene, config: ComplianceConfig):
         kin = physics.kinematics(scene, state)
         point = kin.body_pos[body] + quat.rotate(kin.body_quat[body], centre[body])
         J = physics.point_jacobian(scene, kin, point, body)
-        f = jnp.where(time < PUSH_SECONDS, force, 0.0)
+        f = force * (time < PUSH_SECONDS)
         given = controller, displacement, J[None], f[None], alpha, room
         if config.law == "admittance":
             displacement = compliance.admittance(*given)
         elif config.law == "measured":
-            displacement = compliance.measured(*given, (J @ state.qvel)[None])
+            displacement = compliance.measured(*given, jnp.matmul(J, state.qvel)[None])
         else:
             displacement = compliance.algorithm_1(
                 *given, lambda qfrc: physics.mass_solve(scene, kin, qfrc)
             )
         q_bar = quat.oplus(scene.coords, q_m, displacement.u)
-        qfrc = pd.torque(character, state.qpos, state.qvel, q_bar, h) + J.T @ f
+        qfrc = pd.torque(character, state.qpos, state.qvel, q_bar, h) + jnp.matmul(
+            J.T, f
+        )
         qfrc = qfrc + held(q_m, state, h)
         state = physics.integrate(scene, state, physics.solve(scene, kin, state, qfrc))
         u = quat.log_map(scene.coords, displacement.u)
@@ -127,12 +130,14 @@ def simulate_all(
     scene: physics.Scene, law: str, newtons: float, alpha: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """|log u| of the joints, degrees, and the point's way, m, [15 bodies, 6, T]."""
-    one = pushed(scene, ComplianceConfig(law=law))
+    one = pushed(scene, ComplianceConfig(law=cast(Law, law)))
     bodies, directions = np.meshgrid(np.arange(1, 16), np.arange(6), indexing="ij")
     forces = newtons * DIRECTIONS[directions.ravel()]
     run = jax.jit(
         lambda bodies, forces: jax.lax.map(
-            lambda a: one(*a, jnp.asarray(alpha)), (bodies, forces), batch_size=45
+            lambda a: one(a[0], a[1], jnp.asarray(alpha)),
+            (bodies, forces),
+            batch_size=45,
         )
     )
     u, point = run(jnp.asarray(bodies.ravel()), jnp.asarray(forces, jnp.float32))
@@ -189,7 +194,7 @@ def _at_the_end(course: np.ndarray) -> np.ndarray:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("runs/compliance_map"))
     parser.add_argument("--force", type=float, default=100.0, help="N")
     parser.add_argument("--alpha", type=float, default=0.5)

@@ -17,6 +17,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import mujoco
 import numpy as np
+from mpl_toolkits.mplot3d import Axes3D
 
 from dcc_jax.character import load_character
 from dcc_jax.control.stiffness import (
@@ -45,9 +46,7 @@ def posed(model: mujoco.MjModel, joints: dict[str, tuple[float, ...]]) -> np.nda
     return qpos
 
 
-def draw_character(
-    axes: plt.Axes, model: mujoco.MjModel, qpos: np.ndarray
-) -> np.ndarray:
+def draw_character(axes: Axes3D, model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
     """Draws the bones; returns where the palm is, [3]."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
@@ -63,7 +62,7 @@ def draw_character(
     return palm
 
 
-def draw_shell(axes: plt.Axes, centre: np.ndarray, K: np.ndarray, **style) -> None:
+def draw_shell(axes: Axes3D, centre: np.ndarray, K: np.ndarray, **style) -> None:
     """Where the forces of `FORCE` N take the point: the ellipsoid K^-1 f."""
     principal, stiffnesses = ellipsoid(K)
     longitude, latitude = np.mgrid[0 : 2 * np.pi : 33j, 0 : np.pi : 17j]
@@ -80,7 +79,7 @@ def draw_shell(axes: plt.Axes, centre: np.ndarray, K: np.ndarray, **style) -> No
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("runs/fig2_stiffness.png"))
     parser.add_argument("--alpha", type=float, default=0.5)
     options = parser.parse_args()

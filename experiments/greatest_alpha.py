@@ -64,7 +64,7 @@ def jacobian(model: mujoco.MjModel, q: np.ndarray, body: str) -> np.ndarray:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument(
         "--newtons", type=float, default=100.0, help="size of the force"
     )

@@ -25,7 +25,6 @@ import itertools
 import numpy as np
 
 from dcc_jax import runtime
-from dcc_jax.training import loop
 
 runtime.ensure()
 
@@ -33,7 +32,7 @@ import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import mujoco  # noqa: E402
 
-from dcc_jax import config  # noqa: E402
+from dcc_jax import config, tasks  # noqa: E402
 from dcc_jax.character import CONTROL_RATE  # noqa: E402
 from dcc_jax.env.environment import Environment  # noqa: E402
 from dcc_jax.tasks.ball import Ball  # noqa: E402
@@ -176,7 +175,7 @@ def pushes(environment: Environment, speed: float) -> np.ndarray:
 
 def main() -> None:
     """Parses the arguments, finds the regulator, tries it, prints."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("task", choices=EVENTS)
     parser.add_argument("--time", type=float, default=0.5, help="s into the clip")
     parser.add_argument("--speed", type=float, nargs="+", default=[0.05, 0.1, 0.2])
@@ -184,9 +183,10 @@ def main() -> None:
     options = parser.parse_args()
     wanted = config.make_config(options.task)
     env = dataclasses.replace(wanted.env, alpha=0.0)
-    environment = loop.make_environment(dataclasses.replace(wanted, env=env))
-    if isinstance(environment.task, Ball):
-        environment.task = dataclasses.replace(environment.task, tilt=0.0)
+    task = wanted.task
+    if isinstance(task, Ball):
+        task = dataclasses.replace(task, tilt=0.0)
+    environment = tasks.make_environment(task, env)
     system = System(environment, options.time)
     held = system.equilibrium()
     A, B, left = system.linearised(*held)

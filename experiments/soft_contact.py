@@ -84,7 +84,7 @@ class Held(Pulled):
 
     def reset(
         self, key: Array, scene: physics.Scene, reference: RefState
-    ) -> tuple[HeldState, Array, Array]:
+    ) -> tuple[Any, Array, Array]:
         """The task's own; nothing is held yet."""
         task_key, which_key, way_key = jax.random.split(key, 3)
         task, qpos, qvel = self.task.reset(task_key, scene, reference)
@@ -106,15 +106,19 @@ class Held(Pulled):
         return state, qpos, qvel
 
     def control_step(
-        self, key: Array, scene: physics.Scene, state: HeldState, body: physics.State
-    ) -> tuple[HeldState, physics.State]:
+        self, key: Array, scene: physics.Scene, state: Any, body: physics.State
+    ) -> tuple[Any, physics.State]:
         """The task's own; the springs take hold, and their ends move away."""
         task, body = self.task.control_step(key, scene, state.task, body)
         time, before = state.time + CONTROL_DT, state.time < BEGIN
         here_w, closing_w = self._here(scene, state, body)
         inward = jnp.array([spring.inward for spring in SPRINGS])[state.spring]
-        anchor_w = jnp.where(before, here_w, state.anchor_w)
-        way_w = jnp.where(before & inward, closing_w, state.way_w)
+        anchor_w: Array = jax.lax.select(
+            jnp.broadcast_to(before, (2, 3)), here_w, state.anchor_w
+        )
+        way_w: Array = jax.lax.select(
+            jnp.broadcast_to(before & inward, (2, 3)), closing_w, state.way_w
+        )
         share = jnp.clip((time - BEGIN) / CLOSING, 0.0, 1.0)
         k = jnp.array([spring.stiffness for spring in SPRINGS])[state.spring]
         k = jnp.where(time < BEGIN, 0.0, k)
@@ -127,7 +131,7 @@ class Held(Pulled):
         return HeldState(task, hands, time, state.spring, anchor_w, way_w), body
 
     def _here(
-        self, scene: physics.Scene, state: HeldState, body: physics.State
+        self, scene: physics.Scene, state: Any, body: physics.State
     ) -> tuple[Array, Array]:
         """Where the bodies are [2, 3], and the way inwards from there [2, 3], m."""
         q = scene.character_qpos(body.qpos)
@@ -138,7 +142,7 @@ class Held(Pulled):
         return pos_w[jnp.array(rows)[state.spring]], quat.rotate(heading, inward)
 
     def evaluate(
-        self, scene: physics.Scene, state: HeldState, body: physics.State
+        self, scene: physics.Scene, state: Any, body: physics.State
     ) -> dict[str, Array]:
         """Which spring holds the character."""
         return {"spring": state.spring.astype(jnp.float32)}

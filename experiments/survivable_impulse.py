@@ -65,7 +65,7 @@ class Struck(Pulled):
 
     def reset(
         self, key: Array, scene: physics.Scene, reference: RefState
-    ) -> tuple[StruckState, Array, Array]:
+    ) -> tuple[Any, Array, Array]:
         """The task's own; the push comes later."""
         task_key, angle_key, impulse_key = jax.random.split(key, 3)
         task, qpos, qvel = self.task.reset(task_key, scene, reference)
@@ -82,8 +82,8 @@ class Struck(Pulled):
         return StruckState(task, hands, jnp.zeros(()), angle, impulse), qpos, qvel
 
     def control_step(
-        self, key: Array, scene: physics.Scene, state: StruckState, body: physics.State
-    ) -> tuple[StruckState, physics.State]:
+        self, key: Array, scene: physics.Scene, state: Any, body: physics.State
+    ) -> tuple[Any, physics.State]:
         """The task's own, and the push while it lasts."""
         task, body = self.task.control_step(key, scene, state.task, body)
         _, heading = features.local_frame(scene.character_qpos(body.qpos))
@@ -99,7 +99,7 @@ class Struck(Pulled):
         return dataclasses.replace(state, task=task, hands=hands, time=time), body
 
     def evaluate(
-        self, scene: physics.Scene, state: StruckState, body: physics.State
+        self, scene: physics.Scene, state: Any, body: physics.State
     ) -> dict[str, Array]:
         """The push: its angle (rad), and its impulse (N s / kg)."""
         return {"angle": state.angle, "impulse": state.impulse}
@@ -153,8 +153,8 @@ def draw(points: list[paired.Row], out: Path) -> None:
         style = paired.line(arm, levels)
         closed = [p["value"] for p in [*own, own[0]]]
         axes.plot(angle, closed, label=paired.label(arm), **style)
-        bounds = [[p[k] for p in [*own, own[0]]] for k in ("low", "high")]
-        axes.fill_between(angle, *bounds, color=style["color"], alpha=0.15)
+        low, high = ([p[k] for p in [*own, own[0]]] for k in ("low", "high"))
+        axes.fill_between(angle, low, high, color=style["color"], alpha=0.15)
     axes.set_title("survivable impulse at the chest (N s / kg), front is up")
     axes.legend(loc="lower left", fontsize=8)
     figure.savefig(out, dpi=110)

@@ -107,7 +107,8 @@ def test_update_is_saved_although_a_later_one_is_damaged(run_dir):
     found = checkpoint.restore_latest(run_dir, _state(0), said.append)
     assert found is not None and found[0] == 3 and len(said) == 1
     checkpoint.save(run_dir, 4, _state(4), keep=3)
-    assert checkpoint.restore_latest(run_dir, _state(0), _silent)[0] == 4
+    found = checkpoint.restore_latest(run_dir, _state(0), _silent)
+    assert found is not None and found[0] == 4
 
 
 def test_missing_file_is_damage_too(run_dir):

@@ -15,6 +15,7 @@ from dcc_jax import config
 from dcc_jax.learn import learner
 from dcc_jax.play import runs
 from dcc_jax.training import logs, loop
+from dcc_jax.training.sweep import SweepResult
 from toy import Toy
 from toy_learner import compiled_toy
 from toy_run import INTERVAL, toy_config
@@ -25,7 +26,7 @@ sweeping = importlib.import_module("dcc_jax.training.sweep")
 SEEDS, ALPHAS, UPDATES = (3, 4), (0.0, 0.8), 30
 
 
-def _sweep(run_dir: Path, updates: int, **options: Any) -> sweeping.SweepResult:
+def _sweep(run_dir: Path, updates: int, **options: Any) -> SweepResult:
     # vmap turns the `cond` of the auto-reset into a select over its operands, which
     # the checker takes for a second use of the keys.
     with jax.debug_key_reuse(False):
@@ -40,11 +41,11 @@ def _sweep(run_dir: Path, updates: int, **options: Any) -> sweeping.SweepResult:
 
 
 @pytest.fixture(scope="module")
-def result(tmp_path_factory: pytest.TempPathFactory) -> sweeping.SweepResult:
+def result(tmp_path_factory: pytest.TempPathFactory) -> SweepResult:
     return _sweep(tmp_path_factory.mktemp("sweep") / "whole", UPDATES, quiet=True)
 
 
-def _comparable(result: sweeping.SweepResult) -> list[dict[str, Any]]:
+def _comparable(result: SweepResult) -> list[dict[str, Any]]:
     """The rows without what tells of the machine."""
     return [
         {name: x for name, x in row.items() if name not in logs.WALL_CLOCK}

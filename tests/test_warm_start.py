@@ -9,13 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dcc_jax import quat
+from dcc_jax import quat, tasks
 from dcc_jax.config import make_config
 from dcc_jax.env.environment import Environment
 from dcc_jax.learn import learner
 from dcc_jax.learn.rollout import Policy
 from dcc_jax.learn.state import TrainConfig, TrainState
-from dcc_jax.training import loop
 from toy import Toy, ToyConfig
 
 
@@ -58,7 +57,8 @@ def test_negative_steps_are_refused():
 
 @pytest.fixture(scope="module", params=["trampoline", "door"])
 def environment(request) -> Environment:
-    return loop.make_environment(make_config(request.param))
+    config = make_config(request.param)
+    return tasks.make_environment(config.task, config.env)
 
 
 def test_demonstration_asks_for_the_pose_a_little_later(environment):

@@ -36,7 +36,7 @@ def course(q_m, J, force, alpha, seconds):
     room = CONTROLLER.room(q_m)
 
     def step(displacement, index):
-        f = jnp.where(index * DT < seconds, force, 0.0)
+        f = force * (index * DT < seconds)
         displacement = compliance.admittance(
             CONTROLLER, displacement, J[None], f[None], alpha, room
         )

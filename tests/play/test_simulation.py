@@ -51,8 +51,8 @@ def hand_at(simulation: Simulation, qpos: np.ndarray) -> np.ndarray:
 def settled(simulation: Simulation, steps: int = SETTLING) -> np.ndarray:
     """qpos after a while."""
     for _ in range(steps):
-        moment = simulation.step()
-    return np.asarray(moment.motion.qpos, float)
+        simulation.step()
+    return np.asarray(simulation.history[-1].motion.qpos, float)
 
 
 def rest_under(

@@ -264,9 +264,10 @@ def test_constraint_force_equals_c_mujocos(scene, aloft, pull, seed):
 
 def test_partner_bears_a_weight_that_hangs_on_the_hand(scene, aloft, pull):
     qfrc = aloft.hold + aloft.lift.T @ WEIGHT
-    state = None
+    state = forces = None
     for _ in range(60):
         state, _, _, forces = pull(aloft.q, np.zeros(42), aloft.palm, qfrc, state)
+    assert forces is not None
     np.testing.assert_allclose(forces.force_w[0], -WEIGHT, atol=1.0)
 
 

@@ -10,11 +10,11 @@ import mujoco
 import numpy as np
 import pytest
 
+from dcc_jax import tasks
 from dcc_jax.config import make_config
 from dcc_jax.env.environment import Environment
 from dcc_jax.tasks.chicken_fight import LONG
 from dcc_jax.tasks.match import Match
-from dcc_jax.training import loop
 
 MASSES = 85.0, 36.0  # kg, Sec. 5.3
 STEPS = 10  # a third of a second
@@ -24,7 +24,7 @@ CLOSING = 1.5  # m/s, of each
 def environment(mass: float, rate: int = 240) -> Environment:
     config = make_config("chicken-fight", "smoke")
     env = dataclasses.replace(config.env, mass=mass, physics_rate=rate)
-    return loop.make_environment(dataclasses.replace(config, env=env))
+    return tasks.make_environment(config.task, env)
 
 
 @pytest.fixture(scope="module")

@@ -111,18 +111,22 @@ def _train_discriminator(
     rows = jax.random.randint(row_key, (count,), 0, flat.s.shape[0])
     policy = jax.tree.map(lambda x: x[rows], flat)
 
-    clean = [
-        discriminator.inputs(state.feature_normalizer, pairs, config.disc)
-        for pairs in (expert, policy)
-    ]
+    normal, noise_keys = state.feature_normalizer, jax.random.split(noise_key)
+    x_expert = discriminator.inputs(normal, expert, config.disc)
+    x_policy = discriminator.inputs(normal, policy, config.disc)
 
     def minibatches(key: Array, x: Array) -> Array:
         x = discriminator.blurred(key, x, flat.s.shape[-1], config.disc)
         return x.reshape(config.disc.minibatches, size, -1)
 
-    noisy = map(minibatches, jax.random.split(noise_key), clean)
-    disc, metrics = discriminator.update(state.disc, *noisy, config.disc, AXIS)
-    metrics |= discriminator.judged(disc.params, *clean)
+    disc, metrics = discriminator.update(
+        state.disc,
+        minibatches(noise_keys[0], x_expert),
+        minibatches(noise_keys[1], x_policy),
+        config.disc,
+        AXIS,
+    )
+    metrics |= discriminator.judged(disc.params, x_expert, x_policy)
     both = jnp.concatenate([policy.s_next, expert.s_next])
     return disc, metrics, normalizer.moments(both)
 

@@ -31,7 +31,7 @@ class ContactRows:
 def contact_rows(model: mjx.Model, data: mjx.Data) -> ContactRows:
     """Of a state with its contacts, as `mjx.make_constraint` has them (condim 3)."""
     contact = data._impl.contact
-    depth = contact.dist - contact.includemargin
+    depth = jnp.subtract(contact.dist, contact.includemargin)
     touching = depth < 0.0
     first, second = jnp.asarray(model.geom_bodyid)[contact.geom].T
     weight = model.body_invweight0[first, 0] + model.body_invweight0[second, 0]
@@ -42,7 +42,7 @@ def contact_rows(model: mjx.Model, data: mjx.Data) -> ContactRows:
         weight * (1.0 - impedance) / impedance, mujoco.mjMINVAL
     )
     return ContactRows(
-        frame_w=jnp.where(touching[:, None, None], contact.frame, 0.0),
+        frame_w=contact.frame * touching[:, None, None],
         point_w=contact.pos,
         friction=contact.friction[:, :2],
         D=1.0 / regularization,
@@ -55,24 +55,24 @@ def _reference(
     model: mjx.Model, contact: mjx.Contact, depth: Array
 ) -> tuple[Array, Array, Array]:
     """Stiffness, damping and impedance [C] (MuJoCo, "solver parameters")."""
-    time, ratio = contact.solref.T
+    first, ratio = jnp.asarray(contact.solref).T
+    time = first
     if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE:
         time = jnp.maximum(time, 2.0 * model.opt.timestep)
-    low, high, width, middle, power = contact.solimp.T
+    low, high, width, middle, power = jnp.asarray(contact.solimp).T
     least, most = mujoco.mjMINIMP, mujoco.mjMAXIMP
-    low, high, middle = (jnp.clip(x, least, most) for x in (low, high, middle))
+    low, high = jnp.clip(low, least, most), jnp.clip(high, least, most)
+    middle = jnp.clip(middle, least, most)
     power = jnp.maximum(1.0, power)
     stiffness = 1.0 / jnp.square(high * time * ratio)
     damping = 2.0 / (high * time)
-    stiffness = jnp.where(
-        contact.solref[:, 0] <= 0.0, -contact.solref[:, 0] / high**2, stiffness
-    )
-    damping = jnp.where(
-        contact.solref[:, 1] <= 0.0, -contact.solref[:, 1] / high, damping
-    )
+    # Numbers that are not positive are stiffness and damping themselves.
+    stiffness = jnp.where(first <= 0.0, -first / high**2, stiffness)
+    damping = jnp.where(ratio <= 0.0, -ratio / high, damping)
     x = jnp.abs(depth) / jnp.maximum(mujoco.mjMINVAL, width)
     rising = x**power / middle ** (power - 1.0)
     ending = 1.0 - (1.0 - x) ** power / (1.0 - middle) ** (power - 1.0)
     y = jnp.where(x < middle, rising, ending)
     impedance = jnp.clip(low + y * (high - low), low, high)
-    return stiffness, damping, jnp.where(x > 1.0, high, impedance)
+    impedance = jnp.where(x > 1.0, high, impedance)
+    return stiffness, damping, impedance  # pyright: ignore[reportReturnType]

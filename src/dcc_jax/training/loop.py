@@ -198,7 +198,7 @@ def _lowered(run: Run, template: TrainState) -> jax.stages.Lowered:
         template,
         shardings,
     )
-    return update.lower(sharded)
+    return update.lower(sharded)  # pyright: ignore[reportFunctionMemberAccess]
 
 
 def _save(run: Run, done: int, state: TrainState) -> None:
