@@ -144,8 +144,9 @@ class Held(Pulled):
     def evaluate(
         self, scene: physics.Scene, state: Any, body: physics.State
     ) -> dict[str, Array]:
-        """Which spring holds the character."""
-        return {"spring": state.spring.astype(jnp.float32)}
+        """The task's own, and which spring holds the character."""
+        own = Pulled.evaluate(self, scene, state, body)
+        return own | {"spring": state.spring.astype(jnp.float32)}
 
 
 def lines(rows: list[paired.Row]) -> Iterator[str]:

@@ -101,8 +101,9 @@ class Struck(Pulled):
     def evaluate(
         self, scene: physics.Scene, state: Any, body: physics.State
     ) -> dict[str, Array]:
-        """The push: its angle (rad), and its impulse (N s / kg)."""
-        return {"angle": state.angle, "impulse": state.impulse}
+        """The task's own, and the push: its angle (rad), its impulse (N s / kg)."""
+        own = Pulled.evaluate(self, scene, state, body)
+        return own | {"angle": state.angle, "impulse": state.impulse}
 
 
 def survivable(impulse: np.ndarray, fell: np.ndarray) -> float:

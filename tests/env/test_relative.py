@@ -72,7 +72,7 @@ def test_velocity_of_the_displaced_reference_is_mujocos(character):
 class Followed(Task):
     """Aloft, following its clip in time; no force is reported."""
 
-    tracks_reference: ClassVar[bool] = True
+    follows_reference: ClassVar[bool] = True
 
     @property
     def has_floor(self) -> bool:
@@ -143,7 +143,7 @@ class HeldAndPulled(Task):
     A weld would give way by a tenth of what the stiffest direction of the hand does.
     """
 
-    tracks_reference: ClassVar[bool] = True
+    follows_reference: ClassVar[bool] = True
 
     @property
     def has_floor(self) -> bool:

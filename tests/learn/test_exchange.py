@@ -57,7 +57,7 @@ def _unordered(jaxpr: Jaxpr) -> list[str]:
 def test_programs_leave_no_exchange_beside_a_loop_with_exchanges(task, tracks):
     """Of tasks that imitate and that follow in time; no environment exchanges."""
     run = config.make_config(task, "smoke")
-    assert tasks.make_task(task).tracks_reference == tracks
+    assert tasks.make_task(task).follows_reference == tracks
     environment = Toy(tracks_reference=tracks)
     mesh = learner.make_mesh(run.train)
     init = learner.make_init(environment, run, mesh)

@@ -82,7 +82,7 @@ def windows(refs):
     @jax.jit
     @chex.assert_max_traces(n=1)
     def draw(references, key):
-        return references.sample_windows(key, WINDOWS)
+        return references.sample_windows(key, WINDOWS)[0]
 
     return [np.array(draw(refs, jax.random.key(seed))) for seed in (0, 1)]
 

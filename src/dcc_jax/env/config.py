@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from dcc_jax.character import CONTROL_RATE
 from dcc_jax.control.config import ComplianceConfig
 from dcc_jax.env.rewards import RewardConfig
+
+Imitation = Literal["task", "adversarial", "tracking"]
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,11 @@ class EnvConfig:
     clips: tuple[str, ...] = ()
     """Clips `*.npz`, motion files such as `*.bvh`, which are imported, or names of the
     package's clips; empty: the task's own choice."""
+
+    imitation: Imitation = "task"
+    """What r_q is: `adversarial`, the discriminator's score, Eq. (13); `tracking`, the
+    distance to the reference's pose, of which actions are then offsets; or what the
+    `task` says."""
 
     compliance: ComplianceConfig = field(default_factory=ComplianceConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)

@@ -48,10 +48,18 @@ class Environment:
         references: References,
         config: EnvConfig,
     ) -> None:
-        _check_law(task, config)
         self.task = task
+        self.imitation = imitation(task, config)
+        self.tracks_reference = self.imitation == "tracking"
+        self.follows_reference = follows_reference(task, config)
+        self.has_phase = self.tracks_reference or (
+            self.follows_reference and task.conditions_on_phase
+        )
+        conditioned = self.has_phase and not self.tracks_reference
+        self.condition_size = observation.PHASE_SIZE if conditioned else 0
         self.config = config
         self.references = references
+        self._check_law()
         model = compose_scene(
             character,
             timestep=1.0 / config.physics_rate,
@@ -70,11 +78,9 @@ class Environment:
         self.fallen = outcome.FallTest.of(config, references)
         self.expert_lead = expert.lead(character, CONTROL_DT)
         self.action_size = character.num_joint_dofs + task.extra_actions
-        self.observation_size = observation.size(task)
+        self.observation_size = observation.size(task, self.has_phase)
         self.feature_size = features.FEATURE_SIZE
-        self.condition_size = 0
         self.has_task_reward = task.has_reward
-        self.tracks_reference = task.tracks_reference
 
     def reset(self, key: Array, alpha: Array | None = None) -> EnvState:
         """A new episode at a moment of the reference (Reference State Initialization).
@@ -93,7 +99,7 @@ class Environment:
             obs=jnp.zeros(self.observation_size),
             features=jnp.zeros(self.feature_size),
             previous_features=jnp.zeros(self.feature_size),
-            condition=jnp.zeros(0),
+            condition=jnp.zeros(self.condition_size),
             r_q=zero,
             r_p=zero,
             r_task=zero,
@@ -163,7 +169,7 @@ class Environment:
         pose = self._target_pose(reference, action)
         sums = metrics.no_sums(state.alpha)
         start = Substep(body, state.displacement, task, state.time, sums)
-        q_m = reference.qpos if self.task.tracks_reference else pose
+        q_m = reference.qpos if self.tracks_reference else pose
         room = self.controller.room(q_m)
         return start, ControlInputs(
             action, pose, state.alpha, room, state.reference, reference, state.time
@@ -193,17 +199,18 @@ class Environment:
         return terminate_on_nonfinite(self._judged(self.observed(new)), state)
 
     def expert_pairs(self, key: Array, n: int) -> tuple[Array, Array, Array]:
-        """(s, s') ~ M: features [n, 270] twice, and the condition [n, 0]."""
-        s, s_next = expert.pairs(self.kinematics, self.references, key, n)
-        return s, s_next, jnp.zeros((n, 0))
+        """(s, s') ~ M: features [n, 270] twice, and the condition [n, C]."""
+        s, s_next, phase = expert.pairs(self.kinematics, self.references, key, n)
+        condition = jax.vmap(observation.of_phase)(phase)
+        return s, s_next, condition[:, : self.condition_size]
 
     def expert_action(self, key: Array) -> tuple[Array, Array]:
         """A moment of the clips and what leads on from there: obs [O], action [A]."""
         state, task = self.reset(key), self.task
         at = state.reference
         ahead = task.reference(self.references, state.task, at, self.expert_lead)
-        follows = task.tracks_reference
-        base = self._following(at, state.task).qpos if follows else self.nominal
+        tracks = self.tracks_reference
+        base = self._following(at, state.task).qpos if tracks else self.nominal
         turn = expert.action(self.kinematics, base, ahead.qpos)
         return state.obs, jnp.pad(turn, (0, task.extra_actions))
 
@@ -216,7 +223,7 @@ class Environment:
         clip_key, place_key = jax.random.split(key)
         begin = not self.config.random_start
         reference = self.task.first_reference(clip_key, self.references, begin)
-        if not self.task.tracks_reference:
+        if not self.follows_reference:
             reference = _at_origin(reference)
             return reference, reference
         radius = self.task.start_radius
@@ -225,7 +232,7 @@ class Environment:
 
     def _following(self, reference: RefState, task: Any) -> RefState:
         """The reference a control step later, where it is followed in time."""
-        if not self.task.tracks_reference:
+        if not self.follows_reference:
             return reference
         return self.task.reference(self.references, task, reference, CONTROL_DT)
 
@@ -237,7 +244,7 @@ class Environment:
 
     def _target_pose(self, reference: RefState, action: Array) -> Array:
         """What the policy asks for [55]: a (+) from the clip's pose or the nominal."""
-        pose = reference.qpos if self.task.tracks_reference else self.nominal
+        pose = reference.qpos if self.tracks_reference else self.nominal
         tangent = jnp.concatenate(
             [jnp.zeros(6, action.dtype), action[: Character.num_joint_dofs]]
         )
@@ -247,13 +254,21 @@ class Environment:
     def observed(self, state: EnvState) -> EnvState:
         """Fills in the features and the observation."""
         obs, body_features = observation.observation(
-            self.task, self.scene, self.kinematics, state, self._root_target(state)
+            self.task,
+            self.scene,
+            self.kinematics,
+            state,
+            self._root_target(state),
+            self.has_phase,
         )
         first = state.time == 0.0
         return dataclasses.replace(
             state,
             obs=obs,
             features=body_features,
+            condition=observation.of_phase(state.reference.phase)[
+                : self.condition_size
+            ],
             previous_features=jnp.where(first, body_features, state.previous_features),
         )
 
@@ -265,7 +280,7 @@ class Environment:
         target = self._root_target(state)
         ground = task.ground_height(scene, state.task, state.body)
         r_q, over = jnp.zeros(()), state.time >= config.episode_seconds - 1e-4
-        if task.tracks_reference:
+        if self.tracks_reference:
             r_q = outcome.tracking(
                 self.kinematics,
                 q,
@@ -273,6 +288,7 @@ class Environment:
                 state.reference.qpos,
                 config.reward,
             )
+        if self.follows_reference:
             over |= outcome.clip_ended(self.references, state.reference)
         return dataclasses.replace(
             state,
@@ -291,17 +307,28 @@ class Environment:
         )
 
     def _root_target(self, state: EnvState) -> RootTarget:
-        if self.task.tracks_reference:
+        if self.follows_reference:
             return RootTarget(state.reference.qpos[:2], state.reference.qvel[:2])
         return self.task.root_target(self.scene, state.task, state.start, state.time)
 
+    def _check_law(self) -> None:
+        if self.config.compliance.law == "measured" and not self.tracks_reference:
+            raise ValueError(
+                "env.compliance.law must be 'algorithm_1' or 'admittance' for task "
+                f"{self.task.name!r}, which tracks no reference, got 'measured'"
+            )
 
-def _check_law(task: Task, config: EnvConfig) -> None:
-    if config.compliance.law == "measured" and not task.tracks_reference:
-        raise ValueError(
-            "env.compliance.law must be 'algorithm_1' or 'admittance' for task "
-            f"{task.name!r}, which follows no reference in time, got 'measured'"
-        )
+
+def imitation(task: Task, config: EnvConfig) -> str:
+    """`adversarial` or `tracking`: what r_q is with a task and a configuration."""
+    if config.imitation != "task":
+        return config.imitation
+    return "tracking" if task.follows_reference else "adversarial"
+
+
+def follows_reference(task: Task, config: EnvConfig) -> bool:
+    """Whether the reference goes on in time with a task and a configuration."""
+    return task.follows_reference or imitation(task, config) == "tracking"
 
 
 def _at_origin(reference: RefState) -> RefState:

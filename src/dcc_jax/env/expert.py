@@ -20,11 +20,13 @@ Array = jax.Array
 
 def pairs(
     kinematics: Kinematics, references: References, key: Array, n: int
-) -> tuple[Array, Array]:
-    """(s, s') ~ M: the features [n, 270] of clips, now and a control step later."""
-    windows = references.sample_windows(key, n)
+) -> tuple[Array, Array, Array]:
+    """(s, s') ~ M: the features [n, 270] of clips, now and a control step later, and
+    the clip's phase [n] then."""
+    windows, phase = references.sample_windows(key, n)
     pair = jax.vmap(lambda q, before: features.body_features(kinematics, q, before))
-    return pair(windows[:, 1], windows[:, 0]), pair(windows[:, 2], windows[:, 1])
+    s, s_next = pair(windows[:, 1], windows[:, 0]), pair(windows[:, 2], windows[:, 1])
+    return s, s_next, phase
 
 
 def lead(character: Character, control_dt: float) -> float:

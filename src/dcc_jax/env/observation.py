@@ -1,7 +1,7 @@
 """What the policy observes (Sec. 4.2), and where things are in it.
 
 One vector: the 306 numbers of the state, the way to the reference's root and its
-velocity over the ground, alpha, the reference's phase where it is followed in time, and
+velocity over the ground, alpha, the reference's phase where it goes on in time, and
 the task's own numbers. Everything is written for ONE environment.
 """
 
@@ -15,19 +15,17 @@ from dcc_jax.env import features
 from dcc_jax.env.features import FEATURE_SIZE, STATE_SIZE, Kinematics
 from dcc_jax.env.state import EnvState
 from dcc_jax.env.task import RootTarget, Task
-from dcc_jax.motion.reference import RefState
 
 Array = jax.Array
 
 ALPHA_ENTRY = STATE_SIZE + 4
 """Where alpha is: behind the way to the root and its velocity, two numbers each."""
-PHASE_SIZE = 3  # where the reference is followed in time
+PHASE_SIZE = 3
 
 
-def size(task: Task) -> int:
-    """How many numbers a policy of the task observes."""
-    phase = PHASE_SIZE if task.tracks_reference else 0
-    return ALPHA_ENTRY + 1 + phase + task.state_size
+def size(task: Task, has_phase: bool) -> int:
+    """How many numbers a policy of the task observes, with the phase or without."""
+    return ALPHA_ENTRY + 1 + has_phase * PHASE_SIZE + task.state_size
 
 
 def observation(
@@ -36,6 +34,7 @@ def observation(
     kinematics: Kinematics,
     state: EnvState,
     target: RootTarget,
+    has_phase: bool,
 ) -> tuple[Array, Array]:
     """The observation [O] of a state, and its features [270].
 
@@ -45,6 +44,7 @@ def observation(
         kinematics: of the character.
         state: now.
         target: the reference's root now.
+        has_phase: whether the reference's phase is in it.
     """
     q = scene.character_qpos(state.body.qpos)
     numbers = features.state(
@@ -56,17 +56,17 @@ def observation(
         _seen_from(q, offset),
         _seen_from(q, target.velocity),
         state.alpha[None],
-        _phase(state.reference) if task.tracks_reference else jnp.zeros(0),
+        of_phase(state.reference.phase) if has_phase else jnp.zeros(0),
         task.observe(scene, state.task, state.body),
     ]
     return jnp.concatenate(parts), numbers[:FEATURE_SIZE]
 
 
-def _phase(reference: RefState) -> Array:
-    """The reference's phase [3]: as it is, and as a point of the circle, where a
-    stride's end is its beginning."""
-    turn = 2.0 * jnp.pi * reference.phase
-    return jnp.stack([reference.phase, jnp.cos(turn), jnp.sin(turn)])
+def of_phase(phase: Array) -> Array:
+    """A phase [] in [0, 1] as it is observed [3]: as it is, and as a point of the
+    circle, where a stride's end is its beginning."""
+    turn = 2.0 * jnp.pi * phase
+    return jnp.stack([phase, jnp.cos(turn), jnp.sin(turn)])
 
 
 def _seen_from(q: Array, vector: Array) -> Array:

@@ -26,7 +26,7 @@ class EnvState:
     obs: Array  # [O]
     features: Array  # [270] s' of the discriminator
     previous_features: Array  # [270] s
-    condition: Array  # [0]
+    condition: Array  # [C] the discriminator's, beside the features
     r_q: Array  # [] where the clip is followed in time, else 0
     r_p: Array  # []
     r_task: Array  # []

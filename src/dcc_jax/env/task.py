@@ -55,10 +55,13 @@ class Task:
     clips: ClassVar[tuple[str, ...]] = ("stand",)
     """Assets in `assets/motions` that a fresh install trains on."""
     has_reward: ClassVar[bool] = False
-    tracks_reference: ClassVar[bool] = False
-    """Whether the reference is followed in time (Sec. 5.4 and Appendix): its phase is
-    observed, actions are offsets from its pose, a tracking reward replaces the
-    discriminator's, and the world is the one that `reference` moves in."""
+    follows_reference: ClassVar[bool] = False
+    """Whether the reference goes on in time (Sec. 5.4 and Appendix): the root's target
+    and the world are where `reference` has them. `env.imitation` says whether its pose
+    is tracked as well, which is the default then, or the discriminator judges."""
+    conditions_on_phase: ClassVar[bool] = True
+    """Whether the discriminator, and the policy with it, are given the phase of a
+    reference that goes on in time; not where a planner makes it."""
     start_radius: ClassVar[float] = 0.0
     """m in x and y, how far beside such a clip an episode may begin."""
     extra_actions: ClassVar[int] = 0

@@ -33,6 +33,7 @@ class Report:
 
     task: str
     parameters: dict[str, dict[str, Any]]  # of the task as it was played, by run
+    imitation: dict[str, str]  # adversarial or tracking, by run
     seed: int
     seconds: float
     conditions: list[Condition]
@@ -250,6 +251,7 @@ def _report(parts: list[Part], plan: EvaluationPlan) -> Report:
             name: asdict(player.environment.task)
             for name, player in plan.players.items()
         },
+        imitation={name: p.environment.imitation for name, p in plan.players.items()},
         seed=plan.seed,
         seconds=plan.seconds,
         conditions=[part.condition for part in parts],

@@ -156,9 +156,10 @@ def _draw_curve(axes: Axes, report: Report, name: str) -> None:
 
 def _title(report: Report) -> str:
     count = len(report.rows) // len(report.conditions)
+    imitation = " and ".join(sorted(set(report.imitation.values())))
     return (
-        f"{report.task}: {count} episodes of {report.seconds:g} s, seed {report.seed}, "
-        "the same perturbations for all"
+        f"{report.task}, {imitation}: {count} episodes of {report.seconds:g} s, "
+        f"seed {report.seed}, the same perturbations for all"
     )
 
 

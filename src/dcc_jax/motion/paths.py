@@ -103,6 +103,14 @@ def go_on(key: Array, gaits: Gaits, motion: Motion) -> Motion:
     )
 
 
+def leashed(motion: Motion, root: Array, leash: float) -> Motion:
+    """The same from within `leash` m of a root [2], m: who is left behind is waited
+    for, and who is carried off is followed."""
+    away = motion.position - root
+    within = jnp.minimum(1.0, leash / length(away))
+    return dataclasses.replace(motion, position=root + within * away)
+
+
 def path(motion: Motion, time: Array) -> tuple[Array, Array, Array]:
     """Position [2], heading [] and speed [] at a moment of the control step."""
     elapsed = time - motion.time

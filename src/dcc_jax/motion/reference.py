@@ -137,8 +137,9 @@ class References:
             travel=_turned(turn, state.travel),
         )
 
-    def sample_windows(self, key: Array, count: int) -> Array:
-        """Expert windows [N, 3, 55] for the discriminator: previous, now, next.
+    def sample_windows(self, key: Array, count: int) -> tuple[Array, Array]:
+        """Expert windows [N, 3, 55] for the discriminator: previous, now, next; and the
+        clip's phase [N] at the last of them.
 
         Three poses one control step apart; none reaches past the end of a clip.
         """
@@ -150,7 +151,7 @@ class References:
         start = jax.random.uniform(time_key, (count,)) * span
         times = start[:, None] + self.control_dt * jnp.arange(3)
         at = jax.vmap(jax.vmap(self.qpos_at, (None, 0)))
-        return at(clip, times)
+        return at(clip, times), jax.vmap(self.phase_at)(clip, times[:, 2])
 
     def _travel(self, clip: Array | int, time: Array) -> Array:
         cycle, _, _ = self._place(clip, time)

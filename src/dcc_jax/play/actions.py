@@ -19,6 +19,7 @@ from dcc_jax.tasks.ball import Ball
 from dcc_jax.tasks.chicken_fight import ChickenFight
 from dcc_jax.tasks.door import Door
 from dcc_jax.tasks.hand_in_hand import HandInHand
+from dcc_jax.tasks.locomotion import Locomotion
 from dcc_jax.tasks.push import Push
 from dcc_jax.tasks.sustained_push import SustainedPush
 from dcc_jax.tasks.trampoline import Trampoline
@@ -71,7 +72,7 @@ def of(task: Task) -> list[Action]:
     schedule = _schedule(task)
     if schedule is not None:
         found.append(Action(schedule.name, _now))
-    if isinstance(task, HandInHand | SustainedPush):
+    if isinstance(task, HandInHand | Locomotion | SustainedPush):
         found += [
             Action("speed", _speed, 0.0, max(task.gaits.speeds), "m/s"),
             Action("turn", _turn, -task.gaits.turn_rate, task.gaits.turn_rate, "rad/s"),

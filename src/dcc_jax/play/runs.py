@@ -12,7 +12,7 @@ from typing import Any
 from dcc_jax import config, tasks
 from dcc_jax.character import asset_path
 from dcc_jax.config import Config
-from dcc_jax.env.environment import Environment
+from dcc_jax.env.environment import Environment, follows_reference
 from dcc_jax.env.task import Task
 from dcc_jax.learn.rollout import Policy
 from dcc_jax.training import checkpoint, folder
@@ -99,7 +99,8 @@ def make_environment(
     env = dataclasses.replace(
         run.config.env,
         episode_seconds=_FOREVER,
-        random_start=run.config.env.random_start and not task.tracks_reference,
+        random_start=run.config.env.random_start
+        and not follows_reference(task, run.config.env),
     )
     environment = tasks.make_environment(task, env)
     sizes = environment.observation_size, environment.action_size

@@ -28,7 +28,7 @@ class Backflip(Trampoline):
 
     name: ClassVar[str] = "backflip"
     clips: ClassVar[tuple[str, ...]] = ("backflip",)
-    tracks_reference: ClassVar[bool] = True
+    follows_reference: ClassVar[bool] = True
     start_radius: ClassVar[float] = 0.05
 
     interval: float = 100.0

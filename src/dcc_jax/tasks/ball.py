@@ -54,7 +54,7 @@ class Ball(Task):
     name: ClassVar[str] = "ball"
     clips: ClassVar[tuple[str, ...]] = ("stand",)
     has_reward: ClassVar[bool] = True
-    tracks_reference: ClassVar[bool] = True
+    follows_reference: ClassVar[bool] = True
     extra_actions: ClassVar[int] = 6
     state_size: ClassVar[int] = 12
     config_overrides: ClassVar[Mapping[str, Any]] = {

@@ -71,7 +71,7 @@ class ChickenFight(Task):
 
     name: ClassVar[str] = "chicken-fight"
     clips: ClassVar[tuple[str, ...]] = ("hop_in_place",)
-    tracks_reference: ClassVar[bool] = True
+    follows_reference: ClassVar[bool] = True
     state_size: ClassVar[int] = 4
     clock: ClassVar[str | None] = "since_bump"
     config_overrides: ClassVar[Mapping[str, Any]] = {

@@ -65,7 +65,7 @@ class Door(Task):
     name: ClassVar[str] = "door"
     clips: ClassVar[tuple[str, ...]] = ("door",)
     has_reward: ClassVar[bool] = True
-    tracks_reference: ClassVar[bool] = True
+    follows_reference: ClassVar[bool] = True
     start_radius: ClassVar[float] = 0.02
     state_size: ClassVar[int] = 7
     camera_azimuth: ClassVar[float] = 20.0  # the door hides what is behind it

@@ -70,7 +70,8 @@ class HandInHand(Task):
 
     name: ClassVar[str] = "hand-in-hand"
     clips: ClassVar[tuple[str, ...]] = planner.LOOPS
-    tracks_reference: ClassVar[bool] = True
+    follows_reference: ClassVar[bool] = True
+    conditions_on_phase: ClassVar[bool] = False
     state_size: ClassVar[int] = 8
 
     gaits: Gaits = field(default_factory=Gaits)

@@ -16,6 +16,7 @@ from dcc_jax.tasks.ball import Ball
 from dcc_jax.tasks.chicken_fight import ChickenFight
 from dcc_jax.tasks.door import Door
 from dcc_jax.tasks.hand_in_hand import HandInHand
+from dcc_jax.tasks.locomotion import Locomotion
 from dcc_jax.tasks.push import Push
 from dcc_jax.tasks.sustained_push import SustainedPush
 from dcc_jax.tasks.trampoline import Trampoline
@@ -26,6 +27,7 @@ TASKS: dict[str, type[Task]] = {
     task.name: task
     for task in (
         Push,
+        Locomotion,
         SustainedPush,
         Trampoline,
         Backflip,

@@ -21,13 +21,13 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from dcc_jax import physics, quat
+from dcc_jax import physics
 from dcc_jax.character import CONTROL_DT
-from dcc_jax.env import features
 from dcc_jax.env.task import Forces, Task, place_character
 from dcc_jax.motion import paths, planner
 from dcc_jax.motion.paths import Gaits, Motion
 from dcc_jax.motion.reference import References, RefState
+from dcc_jax.tasks import locomotion
 
 Array = jax.Array
 
@@ -49,8 +49,9 @@ class SustainedPush(Task):
 
     name: ClassVar[str] = "sustained-push"
     clips: ClassVar[tuple[str, ...]] = planner.LOOPS
-    tracks_reference: ClassVar[bool] = True
-    state_size: ClassVar[int] = 6
+    follows_reference: ClassVar[bool] = True
+    conditions_on_phase: ClassVar[bool] = False
+    state_size: ClassVar[int] = locomotion.SEEN
     clock: ClassVar[str | None] = "since_push"
 
     gaits: Gaits = field(default_factory=Gaits)
@@ -125,9 +126,7 @@ class SustainedPush(Task):
         state = jax.tree.map(lambda a, b: jnp.where(over, a, b), changed, state)
         motion = paths.go_on(motion_key, self.gaits, state.motion)
         root = scene.character_qpos(body.qpos)[:2]
-        away = motion.position - root
-        within = jnp.minimum(1.0, self.leash / paths.length(away))
-        motion = dataclasses.replace(motion, position=root + within * away)
+        motion = paths.leashed(motion, root, self.leash)
         return dataclasses.replace(
             state,
             motion=motion,
@@ -197,26 +196,15 @@ class SustainedPush(Task):
     def observe(
         self, scene: physics.Scene, state: SustainedPushState, body: physics.State
     ) -> Array:
-        """The way to the reference's root, its velocity and cos and sin of its path,
-        over the ground [6]. The push is felt, not seen."""
-        origin, facing = features.local_frame(scene.character_qpos(body.qpos))
-        root, heading, speed = paths.path(state.motion, paths.end(state.motion))
-        ahead = paths.direction(heading)
-        seen = jnp.stack([root - origin[:2], speed * ahead, ahead])
-        level = jnp.pad(seen, ((0, 0), (0, 1)))
-        return quat.rotate(quat.inv(facing), level)[:, :2].reshape(-1)
+        """The path ahead, as `locomotion.seen` [6]. The push is felt, not seen."""
+        return locomotion.seen(scene, state.motion, body)
 
     def evaluate(
         self, scene: physics.Scene, state: SustainedPushState, body: physics.State
     ) -> dict[str, Array]:
-        """The push (N), the speeds of the root and of its path over the ground (m/s),
-        the distance between the two (m), and the time since the last push began (s)."""
-        root, _, speed = paths.path(state.motion, paths.end(state.motion))
-        q, qd = scene.character_qpos(body.qpos), scene.character_qvel(body.qvel)
+        """The push (N), the time since the last one began (s), `locomotion.numbers`."""
         return {
             "push": paths.length(state.force_w),
-            "speed": paths.length(qd[:2]),
-            "path_speed": speed,
-            "path_distance": paths.length(q[:2] - root),
+            **locomotion.numbers(scene, state.motion, body),
             "since_push": state.since,
         }

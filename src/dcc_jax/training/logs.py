@@ -108,12 +108,13 @@ def progress_line(metrics: dict[str, float], total: int) -> str:
     """Update, tuples, speed, time left, reward and its parts, episodes, D."""
     rate = metrics["tuples_per_second"]
     left = max(0.0, total - metrics["tuples"]) / max(rate, 1e-9)
+    imitation = "adversarial" if "disc/accuracy_real" in metrics else "tracking"
     return (
         f"update {metrics['update']:.0f}  "
         f"{metrics['tuples'] / 1e6:.2f}/{total / 1e6:.2f} M tuples  "
         f"{rate:,.0f}/s  {_clock(left)} left  "
         f"r {metrics['reward/total']:.3f} "
-        f"(q {metrics['reward/r_q']:.2f} p {metrics['reward/r_p']:.2f} "
+        f"({imitation} q {metrics['reward/r_q']:.2f} p {metrics['reward/r_p']:.2f} "
         f"task {metrics['reward/r_task']:.2f})  "
         f"episode {metrics['episode/length']:.0f} steps, "
         f"falls {metrics['episode/fall_rate']:.0%}" + _of_discriminator(metrics)

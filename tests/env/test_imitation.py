@@ -1,0 +1,106 @@
+"""What r_q is: the discriminator's score or the distance to the reference's pose."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dcc_jax import config, tasks
+from dcc_jax.env.observation import ALPHA_ENTRY, PHASE_SIZE
+from dcc_jax.play import runs
+from dcc_jax.play.runs import find_run
+
+PHASE = slice(ALPHA_ENTRY + 1, ALPHA_ENTRY + 1 + PHASE_SIZE)
+
+
+def make(task: str, imitation: str):
+    run = config.make_config(task, "smoke").with_({"env.imitation": imitation})
+    return tasks.make_environment(run.task, run.env)
+
+
+@pytest.mark.parametrize(
+    ("task", "imitation", "tracks", "follows", "condition"),
+    [
+        ("push", "task", False, False, 0),
+        ("push", "tracking", True, True, 0),
+        ("door", "task", True, True, 0),
+        ("door", "adversarial", False, True, PHASE_SIZE),
+        ("hand-in-hand", "task", True, True, 0),
+        ("hand-in-hand", "adversarial", False, True, 0),
+    ],
+)
+def test_a_setting_says_who_judges(task, imitation, tracks, follows, condition):
+    environment = make(task, imitation)
+    assert environment.tracks_reference == tracks
+    assert environment.follows_reference == follows
+    assert environment.condition_size == condition
+    assert environment.has_phase == (tracks or condition > 0)
+
+
+@pytest.fixture(scope="module")
+def door():
+    """A door whose discriminator is given the phase: its environment, three states."""
+    environment = make("door", "adversarial")
+    state = jax.jit(environment.reset)(jax.random.key(2))
+    step = jax.jit(environment.step)
+    action, states = jnp.zeros(environment.action_size), [state]
+    for key in jax.random.split(jax.random.key(3)):
+        states.append(step(key, states[-1], action))
+    return environment, states
+
+
+def test_the_discriminator_is_given_the_phase_that_the_policy_observes(door):
+    environment, states = door
+    for state in states:
+        assert state.obs.shape == (environment.observation_size,)
+        np.testing.assert_array_equal(state.condition, state.obs[PHASE])
+    phases = [float(state.reference.phase) for state in states]
+    assert phases[0] < phases[1] < phases[2]
+    np.testing.assert_allclose(states[-1].condition[0], phases[-1])
+
+
+def test_the_clips_come_with_their_phase(door):
+    """A pair that is late in the clip has its phase there: the pose tells the time."""
+    environment, _ = door
+    s, s_next, condition = jax.jit(environment.expert_pairs, static_argnums=1)(
+        jax.random.key(0), 64
+    )
+    assert condition.shape == (64, PHASE_SIZE)
+    turn = np.hypot(condition[:, 1], condition[:, 2])
+    np.testing.assert_allclose(turn, 1.0, rtol=1e-5)
+    clips = environment.references
+    at = jax.vmap(lambda t: clips.phase_at(0, t))(
+        jnp.linspace(0.0, clips.duration[0], 200)
+    )
+    assert float(jnp.min(condition[:, 0])) < 0.2 < 0.8 < float(jnp.max(condition[:, 0]))
+    assert float(jnp.max(condition[:, 0])) <= float(at[-1])
+    assert np.isfinite(s).all() and np.isfinite(s_next).all()
+
+
+def test_an_action_is_from_the_nominal_pose_unless_the_reference_is_tracked(door):
+    environment, states = door
+    zero = jnp.zeros(environment.action_size)
+    _, inputs = environment.begin(jax.random.key(0), states[0], zero)
+    np.testing.assert_allclose(inputs.pose, environment.nominal, atol=1e-6)
+
+
+def test_push_can_track_its_clip_in_time():
+    environment = make("push", "tracking")
+    state = jax.jit(environment.reset)(jax.random.key(0))
+    action = jnp.zeros(environment.action_size)
+    after = jax.jit(environment.step)(jax.random.key(1), state, action)
+    assert after.reference.time > state.reference.time
+    assert 0.95 < after.r_q <= 1.0, "it stands in its reference's pose"
+
+
+def test_what_is_neither_is_refused():
+    with pytest.raises(ValueError, match=r"imitation must be one of .*got 'copying'"):
+        config.make_config("push").with_({"env.imitation": "copying"})
+
+
+def test_a_policy_keeps_the_setting_it_was_trained_with():
+    run = find_run("door")
+    assert run.config.env.imitation == "task"
+    assert runs.make_environment(run).tracks_reference
