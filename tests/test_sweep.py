@@ -14,7 +14,7 @@ import pytest
 from dcc_jax import config
 from dcc_jax.learn import learner
 from dcc_jax.play import runs
-from dcc_jax.training import logs, loop
+from dcc_jax.training import logs, loop, plan
 from dcc_jax.training.sweep import SweepResult
 from toy import Toy
 from toy_learner import compiled_toy
@@ -120,8 +120,8 @@ def test_sweep_that_cannot_go_on_is_one_line(result, changes, said):
 
 
 def test_one_seed_and_one_alpha_need_no_sequence():
-    assert sweeping._settings(toy_config(1), 3, 0.16) == [(3, 0.16)]
-    assert sweeping._settings(toy_config(1), range(2), None) == [(0, None), (1, None)]
+    assert plan.settings_of(toy_config(1), 3, 0.16) == [(3, 0.16)]
+    assert plan.settings_of(toy_config(1), range(2), None) == [(0, None), (1, None)]
 
 
 @pytest.mark.parametrize(
@@ -135,7 +135,7 @@ def test_one_seed_and_one_alpha_need_no_sequence():
 )
 def test_runs_that_make_no_sense_are_named(seeds, alpha, said):
     with pytest.raises(ValueError, match=said):
-        sweeping._settings(toy_config(1), seeds, alpha)
+        plan.settings_of(toy_config(1), seeds, alpha)
 
 
 def test_table_has_a_row_for_every_run_and_update(result):

@@ -57,7 +57,8 @@ def begin(run_dir: Path, wanted: Config) -> None:
 
 
 def _check_whole(run_dir: Path) -> None:
-    if (run_dir.parent / SWEEP).exists():
+    whole = run_dir.parent
+    if (whole / SWEEP).exists() and checkpoint.available(whole):
         raise ValueError(
             f"{run_dir} is one run of the sweep {run_dir.parent}, and goes on with it"
         )

@@ -1,4 +1,4 @@
-"""Many runs as one program: seeds x levels of compliance, vmapped.
+"""Many runs: seeds x levels of compliance, vmapped as one program, or each a job.
 
 Every run has a directory of its own within that of the sweep, which evaluation, video
 and curves take like any other; the checkpoints are of all runs together.
@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import itertools
-import json
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -19,7 +17,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from dcc_jax import runtime
 from dcc_jax.config import Config
@@ -27,11 +24,9 @@ from dcc_jax.learn import learner
 from dcc_jax.learn.rollout import Environment, Policy
 from dcc_jax.learn.state import TrainState
 from dcc_jax.learn.update import chunk_size
-from dcc_jax.training import checkpoint, folder, logs
+from dcc_jax.training import checkpoint, folder, jobs, logs, plan
 from dcc_jax.training.loop import make_environment
 from dcc_jax.training.stop import StopSignal
-
-Setting = tuple[int, float | None]  # seed and alpha of a run
 
 
 @dataclass(frozen=True)
@@ -39,9 +34,9 @@ class SweepResult:
     """One table of all runs."""
 
     rows: list[dict[str, Any]]  # seed, alpha, update and every metric
-    policies: dict[Setting, Policy]  # by (seed, alpha), host arrays
+    policies: dict[plan.Setting, Policy]  # by (seed, alpha), host arrays
     run_dir: Path
-    run_dirs: dict[Setting, Path]  # of every run, within it
+    run_dirs: dict[plan.Setting, Path]  # of every run, within it
     finished: bool  # False: a signal ended it before all tuples were collected
 
     def last(self) -> list[dict[str, Any]]:
@@ -52,7 +47,7 @@ class SweepResult:
     def to_csv(self, path: Path | str) -> None:
         """Writes the table."""
         with Path(path).open("w", newline="") as file:
-            names = list(self.rows[0]) if self.rows else []
+            names = list(dict.fromkeys(name for row in self.rows for name in row))
             writer = csv.DictWriter(file, names)
             writer.writeheader()
             writer.writerows(self.rows)
@@ -63,15 +58,15 @@ class _Sweep:
     """A sweep that is about to begin: its input is checked."""
 
     config: Config  # as it is run, of every run
-    settings: list[Setting]
+    run_dirs: dict[plan.Setting, Path]
     run_dir: Path
     environment: Environment
     mesh: jax.sharding.Mesh
     resume: bool
 
     @property
-    def run_dirs(self) -> dict[Setting, Path]:
-        return {setting: self.run_dir / _name(*setting) for setting in self.settings}
+    def settings(self) -> list[plan.Setting]:
+        return list(self.run_dirs)
 
 
 def sweep(
@@ -82,6 +77,7 @@ def sweep(
     run_dir: Path | str | None = None,
     resume: bool = False,
     environment: Environment | None = None,
+    executor: jobs.Executor | None = None,
     quiet: bool = False,
 ) -> SweepResult:
     """Trains every combination of seed and alpha side by side.
@@ -96,6 +92,9 @@ def sweep(
         run_dir: where everything goes; default `runs/sweep-<task>-<time>`.
         resume: continue the sweep in `run_dir`, bit for bit.
         environment: in place of the task's own.
+        executor: starts every run as a job of its own, such as a
+            `concurrent.futures.ProcessPoolExecutor` or submitit's; None: all are one
+            program of this process.
         quiet: no progress.
 
     Raises:
@@ -104,7 +103,9 @@ def sweep(
         RunError: the sweep failed; its checkpoints are intact.
     """
     runtime.ensure(quiet=quiet)
-    settings = _settings(config, seeds, alpha)
+    settings = plan.settings_of(config, seeds, alpha)
+    if executor is not None:
+        return _as_jobs(executor, config, settings, run_dir, resume, environment, quiet)
     prepared = _prepare(config, settings, run_dir, resume, environment)
     total = config.train.total_tuples
     with logs.Progress(total, quiet) as progress, StopSignal() as stop:
@@ -114,78 +115,50 @@ def sweep(
             raise folder.RunError(f"{error}") from error
 
 
-def _settings(
-    config: Config, seeds: int | Iterable[int], alpha: float | Iterable[float] | None
-) -> list[Setting]:
-    chosen = [seeds] if isinstance(seeds, int | np.integer) else list(seeds)
-    levels = [alpha] if alpha is None or isinstance(alpha, float | int) else list(alpha)
-    runs: list[Setting] = [
-        (int(seed), None if level is None else float(level))
-        for seed, level in itertools.product(chosen, levels)
-    ]
-    if not runs:
-        raise ValueError("sweep needs at least one seed and one alpha")
-    if len({_name(*run) for run in runs}) < len(runs):
-        raise ValueError(
-            f"seeds and alpha must be different numbers, got {chosen} and {levels}"
-        )
-    for seed, level in runs:
-        if not 0 <= seed < 2**32:
-            raise ValueError(f"seeds must be between 0 and 2^32 - 1, got {seed}")
-        if level is not None:
-            config.env.compliance.check_alpha(level)
-    return runs
+def _as_jobs(
+    executor: jobs.Executor,
+    config: Config,
+    settings: list[plan.Setting],
+    run_dir: Path | str | None,
+    resume: bool,
+    environment: Environment | None,
+    quiet: bool,
+) -> SweepResult:
+    run_dir = plan.check(config, settings, run_dir, resume)
+    if environment is None:
+        make_environment(config)  # says now what each of them would
+    runs = plan.begin(config, settings, run_dir)
+    configs = {path: plan.config_of(config, *setting) for setting, path in runs.items()}
+    with logs.Progress(config.train.total_tuples, quiet) as progress:
+        progress.say(f"training {len(settings)} runs, each a job of its own")
+        finished = jobs.run(executor, configs, environment, progress.say)
+    result = SweepResult(
+        rows=plan.rows(runs),
+        policies={
+            setting: checkpoint.load_policy(path) for setting, path in runs.items()
+        },
+        run_dir=run_dir,
+        run_dirs=runs,
+        finished=finished,
+    )
+    result.to_csv(run_dir / "table.csv")
+    return result
 
 
 def _prepare(
     wanted: Config,
-    settings: list[Setting],
+    settings: list[plan.Setting],
     run_dir: Path | str | None,
     resume: bool,
     environment: Environment | None,
 ) -> _Sweep:
-    if run_dir is None:
-        if resume:
-            raise ValueError("resume needs run_dir: the sweep to continue")
-        run_dir = folder.default_run_dir(f"sweep-{wanted.task.name}")
-    run_dir = Path(run_dir)
-    if resume:
-        _check_same(run_dir, settings)
-    folder.check(run_dir, wanted, resume)
+    run_dir = plan.check(wanted, settings, run_dir, resume)
     environment = make_environment(wanted) if environment is None else environment
     mesh = learner.make_mesh(wanted.train)
     config = _chunked(wanted, mesh.size, len(settings))
     learner.check_sizes(config, mesh.size)
-    folder.begin(run_dir, wanted)
-    written = json.dumps(settings).encode()
-    checkpoint.write_atomically(run_dir / folder.SWEEP, written)
-    prepared = _Sweep(config, settings, run_dir, environment, mesh, resume)
-    for (seed, level), path in prepared.run_dirs.items():
-        of_level = {} if level is None else {"env.alpha": level, "env.alpha_max": None}
-        folder.begin(path, wanted.with_({"seed": seed, **of_level}))
-    return prepared
-
-
-def _check_same(run_dir: Path, settings: list[Setting]) -> None:
-    try:
-        written = json.loads((run_dir / folder.SWEEP).read_text())
-        old = [(seed, level) for seed, level in written]
-    except (OSError, ValueError, TypeError):
-        raise ValueError(f"{run_dir} holds no sweep to continue") from None
-    if old != settings:
-        raise ValueError(
-            f"the runs in {run_dir} are {_told(old)} and cannot become "
-            f"{_told(settings)}"
-        )
-
-
-def _told(settings: list[Setting]) -> str:
-    return ", ".join(_name(*setting) for setting in settings)
-
-
-def _name(seed: int, level: float | None) -> str:
-    """Of a run's directory."""
-    return f"seed{seed}" if level is None else f"seed{seed}-alpha{level:g}"
+    runs = plan.begin(wanted, settings, run_dir)
+    return _Sweep(config, runs, run_dir, environment, mesh, resume)
 
 
 def _loop(sweep: _Sweep, progress: logs.Progress, stop: StopSignal) -> SweepResult:
@@ -248,7 +221,7 @@ def _save(sweep: _Sweep, done: int, state: TrainState) -> None:
         checkpoint.save_policy(path, policies[setting])
 
 
-def _policies(sweep: _Sweep, host: TrainState) -> dict[Setting, Policy]:
+def _policies(sweep: _Sweep, host: TrainState) -> dict[plan.Setting, Policy]:
     of_all = Policy(params=host.agent.policy.params, normalizer=host.obs_normalizer)
     return {
         setting: jax.tree.map(lambda x, i=i: x[i], of_all)
@@ -264,7 +237,7 @@ def _finish(
     say: Callable[[str], None],
 ) -> SweepResult:
     result = SweepResult(
-        rows=_rows(sweep),
+        rows=plan.rows(sweep.run_dirs),
         policies=_policies(sweep, jax.device_get(state)),
         run_dir=sweep.run_dir,
         run_dirs=sweep.run_dirs,
@@ -276,16 +249,6 @@ def _finish(
     else:
         say(f"finished after update {done}: {sweep.run_dir}")
     return result
-
-
-def _rows(sweep: _Sweep) -> list[dict[str, Any]]:
-    """The lines of every run's metrics.jsonl, update by update."""
-    logged = [logs.read(path) for path in sweep.run_dirs.values()]
-    return [
-        {"seed": seed, "alpha": level} | row
-        for of_update in zip(*logged, strict=True)
-        for (seed, level), row in zip(sweep.settings, of_update, strict=True)
-    ]
 
 
 def _chunked(config: Config, devices: int, runs: int) -> Config:
