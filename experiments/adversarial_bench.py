@@ -64,7 +64,9 @@ def trained(task: str, lever: str, seed: int, tuples: int, out: Path) -> dict[st
             **LEVERS[lever],
         }
     )
-    dcc_jax.train(config, run_dir=folder, resume=folder.exists(), quiet=True)
+    resume = folder.exists()
+    if not dcc_jax.train(config, run_dir=folder, resume=resume, quiet=True).finished:
+        raise SystemExit(f"stopped in {folder}; the same command goes on")
     rows = logs.read(folder)[-LAST:]
     names = ("reward/r_q", "disc/margin", "disc/gradient_penalty")
     found = {name: fmean(row[name] for row in rows) for name in names}

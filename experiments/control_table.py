@@ -1,9 +1,8 @@
 """The table of docs/results.md that compares levels of compliance, for one skill.
 
-Three arms meet the same episodes: alpha 0, alpha, and the control arm, in which the
-policy observes alpha and nothing is displaced. The last three columns are paired
-differences of the means: alpha against 0, the control arm against 0, and u on against
-u off, which is the difference of the first two and the effect of compliance alone.
+The arms meet the same episodes: alpha 0, each alpha, and its control arm, in which the
+policy observes alpha and nothing is displaced. The last columns are paired differences
+of the means, u on less u off: the effect of compliance alone.
 
     python experiments/control_table.py trampoline            # plays, then prints
     python experiments/control_table.py FILE.json --skill trampoline
@@ -113,7 +112,7 @@ def played(name: str, options: argparse.Namespace) -> dict:
     report = dcc_jax.evaluate(
         run,
         episodes=options.episodes,
-        alpha=(0.0, options.alpha),
+        alpha=(0.0, *options.alpha),
         seconds=skill.seconds,
         task=task,
     )
@@ -121,21 +120,21 @@ def played(name: str, options: argparse.Namespace) -> dict:
 
 
 def table(report: dict, lines: tuple[Line, ...]) -> str:
-    """Markdown: a row a metric, the arms, then the paired differences."""
-    arms = [_name(c) for c in report["conditions"]]
-    low, high, off = arms
-    versus = (f"{high} less {low}", f"{off} less {low}", "u on less u off")
-    head = f"| | {' | '.join([*arms, *versus])} |\n|---|{'--:|' * 6}"
-    rows = [_row(report, line) for line in lines if line.metric in report["rows"][0]]
+    """Markdown: a row a metric, the arms, then what u alone does at each alpha."""
+    conditions = report["conditions"]
+    alone = [c for c in report["comparisons"] if not conditions[c["baseline"]]["u_on"]]
+    heads = [_name(c) for c in conditions]
+    heads += [f"u alone, {conditions[c['condition']]['alpha']:g}" for c in alone]
+    head = f"| | {' | '.join(heads)} |\n|---|{'--:|' * len(heads)}"
+    rows = [
+        _row(report, alone, line) for line in lines if line.metric in report["rows"][0]
+    ]
     return "\n".join([head, *rows])
 
 
-def _row(report: dict, line: Line) -> str:
+def _row(report: dict, alone: list[dict], line: Line) -> str:
     cells = [_text(s[line.metric], line) for s in report["summary"]]
-    cells += [
-        _text(c["difference"][line.metric], line, sign="+")
-        for c in report["comparisons"]
-    ]
+    cells += [_text(c["difference"][line.metric], line, sign="+") for c in alone]
     return f"| {line.text} | {' | '.join(cells)} |"
 
 
@@ -161,7 +160,7 @@ def main() -> None:
     add("--skill", choices=SKILLS, help="whose table FILE.json makes")
     add("--run", type=Path, metavar="RUN_DIR", help="its policy (the one that ships)")
     add("--episodes", type=int, default=64, help="of each arm (64)")
-    add("--alpha", type=float, default=0.16, help="the level above 0 (0.16)")
+    add("--alpha", type=float, nargs="+", default=[0.5, 0.8], help="levels above 0")
     options = parser.parse_args()
     name = options.skill or options.source
     if name not in SKILLS:

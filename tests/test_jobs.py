@@ -87,7 +87,7 @@ def test_a_run_of_a_job_is_the_run_alone(pool, halfway, tmp_path):
 def test_its_table_and_its_policies_are_those_of_any_sweep(halfway):
     assert (halfway.run_dir / "table.csv").exists()
     assert {row["seed"] for row in halfway.last()} == set(SEEDS)
-    with pytest.raises(ValueError, match="is a sweep; its runs are seed3-alpha0.3, "):
+    with pytest.raises(ValueError, match=r"is a sweep; its runs are seed3-alpha0\.3, "):
         runs.find_run(halfway.run_dir)
 
 

@@ -52,8 +52,11 @@ def ensure(
     global _done
     if _done:
         return
-    wanted = _wanted_devices(devices)
+    joined = _processes()
+    wanted = 1 if joined and devices is None else _wanted_devices(devices)
     import_jax()
+    if joined:
+        _join(*joined)
     said = [_set_devices(wanted), _set_cache(cache_dir), _set_precision()]
     check_versions(_backend())
     _done = True
@@ -121,6 +124,32 @@ def cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def _processes() -> tuple[str, int, int] | None:
+    """Coordinator, number of processes and this one's, where there are several."""
+    names = ("DCC_JAX_COORDINATOR", "DCC_JAX_PROCESSES", "DCC_JAX_PROCESS")
+    said = [os.environ.get(name, "") for name in names]
+    if not any(said):
+        return None
+    address, count, index = said
+    right = bool(address) and count.isdecimal() and index.isdecimal()
+    if not (right and int(index) < int(count)):
+        told = ", ".join(f"{n}={text!r}" for n, text in zip(names, said, strict=True))
+        raise ValueError(
+            "several processes need DCC_JAX_COORDINATOR=HOST:PORT, DCC_JAX_PROCESSES=N "
+            f"and DCC_JAX_PROCESS from 0 to N - 1, got {told}"
+        )
+    return address, int(count), int(index)
+
+
+def _join(address: str, count: int, index: int) -> None:
+    """Meets the other processes; gloo carries what CPUs exchange, in one order."""
+    import jax
+
+    jax.config.update("jax_cpu_collectives_implementation", "gloo")
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+    jax.distributed.initialize(address, count, index)
 
 
 def _set_devices(wanted: int) -> str:

@@ -39,11 +39,11 @@ def _prepare(said: Options) -> command.Work:
 
 
 def _train(run: Run) -> None:
-    from dcc_jax.training import loop
+    from dcc_jax.training import loop, processes
 
     try:
         result = loop.execute(run)
-        if result.metrics:
+        if result.metrics and processes.is_first():
             curves.draw([result.run_dir], result.run_dir / "curves.png")
     except loop.RunError as error:
         raise command.WorkError(str(error)) from None

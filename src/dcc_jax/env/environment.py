@@ -38,7 +38,8 @@ class Environment:
     """Static parts of one task's environment; its methods are pure.
 
     Raises:
-        ValueError: measured velocities where the reference is not followed in time.
+        ValueError: measured velocities where no reference is tracked, or tracking of a
+            task that has none.
     """
 
     def __init__(
@@ -59,7 +60,7 @@ class Environment:
         self.condition_size = observation.PHASE_SIZE if conditioned else 0
         self.config = config
         self.references = references
-        self._check_law()
+        self._check()
         model = compose_scene(
             character,
             timestep=1.0 / config.physics_rate,
@@ -311,7 +312,12 @@ class Environment:
             return RootTarget(state.reference.qpos[:2], state.reference.qvel[:2])
         return self.task.root_target(self.scene, state.task, state.start, state.time)
 
-    def _check_law(self) -> None:
+    def _check(self) -> None:
+        if self.tracks_reference and not self.task.trackable:
+            raise ValueError(
+                "env.imitation must be 'adversarial' for task "
+                f"{self.task.name!r}, which has no pose to track, got 'tracking'"
+            )
         if self.config.compliance.law == "measured" and not self.tracks_reference:
             raise ValueError(
                 "env.compliance.law must be 'algorithm_1' or 'admittance' for task "

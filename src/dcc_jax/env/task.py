@@ -59,6 +59,9 @@ class Task:
     """Whether the reference goes on in time (Sec. 5.4 and Appendix): the root's target
     and the world are where `reference` has them. `env.imitation` says whether its pose
     is tracked as well, which is the default then, or the discriminator judges."""
+    trackable: ClassVar[bool] = True
+    """Whether `env.imitation tracking` makes sense: clips or planner have a pose for
+    every moment of the task."""
     conditions_on_phase: ClassVar[bool] = True
     """Whether the discriminator, and the policy with it, are given the phase of a
     reference that goes on in time; not where a planner makes it."""

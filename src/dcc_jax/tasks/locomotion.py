@@ -22,7 +22,7 @@ from dcc_jax.env import features
 from dcc_jax.env.task import Forces, RootTarget, Task, place_character
 from dcc_jax.motion import paths, planner
 from dcc_jax.motion.paths import Gaits, Motion
-from dcc_jax.motion.reference import References, RefState
+from dcc_jax.motion.reference import RefState
 
 Array = jax.Array
 
@@ -49,6 +49,7 @@ class Locomotion(Task):
         *("run", "run_left", "run_right"),
     )
     state_size: ClassVar[int] = SEEN
+    trackable: ClassVar[bool] = False
 
     gaits: Gaits = field(
         default_factory=lambda: Gaits(speeds=(0.0, 0.8, 1.2, 1.6, 2.0, 2.5, 3.0))
@@ -57,23 +58,6 @@ class Locomotion(Task):
     leash: float = 1.0
     """Largest distance between the root and its target at the start of a control step,
     m."""
-
-    def reference(
-        self,
-        references: References,
-        state: LocomotionState,
-        at: RefState,
-        elapsed: float,
-    ) -> RefState:
-        """None: it would be tracked, and a command has no pose in time.
-
-        Raises:
-            ValueError: always.
-        """
-        raise ValueError(
-            "env.imitation must be 'adversarial' for task 'locomotion', which has no "
-            "reference pose in time"
-        )
 
     def reset(
         self, key: Array, scene: physics.Scene, reference: RefState

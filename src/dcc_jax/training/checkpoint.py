@@ -192,10 +192,20 @@ def _activation(arrays: dict[str, np.ndarray]) -> Activation:
 
 
 def _manager(run_dir: Path, keep: int | None = None) -> ocp.CheckpointManager:
+    mine = jax.process_index()
+    # The first of several processes writes, and each reads, without the others.
+    alone = ocp.options.MultiprocessingOptions(
+        primary_host=mine,
+        active_processes={mine},
+        barrier_sync_key_prefix=f"process-{mine}",
+    )
+    (run_dir / _FOLDER).mkdir(parents=True, exist_ok=True)
     options = ocp.CheckpointManagerOptions(
         max_to_keep=keep,
         step_format_fixed_length=_DIGITS,
         enable_async_checkpointing=False,
+        multiprocessing_options=alone,
+        create=False,
     )
     return ocp.CheckpointManager((run_dir / _FOLDER).absolute(), options=options)
 

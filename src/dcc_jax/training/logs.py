@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-WALL_CLOCK = ("seconds", "tuples_per_second")
+WALL_CLOCK = ("seconds", "tuples_per_second", "devices")
 """Fields of `metrics.jsonl` that tell of the machine, not of the run.
 
 All others are the same, bit for bit, whether a run was interrupted or not.

@@ -15,9 +15,9 @@ import numpy as np
 from dcc_jax import runtime, tasks
 from dcc_jax.config import Config
 from dcc_jax.learn import learner, style
-from dcc_jax.learn.rollout import Environment, Policy
-from dcc_jax.learn.state import TrainState, UpdateReport
-from dcc_jax.training import checkpoint, folder, logs
+from dcc_jax.learn.rollout import Environment, Incident, Policy
+from dcc_jax.learn.state import TrainState
+from dcc_jax.training import checkpoint, folder, logs, processes
 from dcc_jax.training.folder import RunError, default_run_dir
 from dcc_jax.training.stop import StopSignal
 from dcc_jax.training.verdict import verdict
@@ -87,15 +87,15 @@ def prepare(
         if resume:
             raise ValueError("resume needs run_dir: the run to continue")
         run_dir = default_run_dir(wanted.task.name)
-    run_dir = Path(run_dir)
-    folder.check(run_dir, wanted, resume)
+    place = Path(run_dir)
     runtime.ensure()
+    processes.by_the_first(lambda: folder.check(place, wanted, resume))
     if environment is None:
         environment = make_environment(wanted)
     mesh = learner.make_mesh(wanted.train)
     learner.check_sizes(wanted, mesh.size)
-    folder.begin(run_dir, wanted)
-    return Run(wanted, run_dir, environment, mesh, resume)
+    processes.by_the_first(lambda: folder.begin(place, wanted))
+    return Run(wanted, place, environment, mesh, resume)
 
 
 def execute(run: Run, *, quiet: bool = False) -> TrainResult:
@@ -104,6 +104,7 @@ def execute(run: Run, *, quiet: bool = False) -> TrainResult:
     Raises:
         RunError: the disk is full, every checkpoint is damaged, and the like.
     """
+    quiet = quiet or not processes.is_first()
     with (
         logs.Progress(run.config.train.total_tuples, quiet) as progress,
         StopSignal() as stop,
@@ -119,9 +120,11 @@ def _loop(run: Run, progress: logs.Progress, stop: StopSignal) -> TrainResult:
     state, update = _prepared(run, progress.say)
     measure_style = jax.jit(partial(style.of_running, run.environment))
     done, nan_count = int(state.update), int(state.nan_count)
-    log = logs.RunLog(run.run_dir, done)
+    log = logs.RunLog(run.run_dir, done) if processes.is_first() else None
     began, saved = time.perf_counter(), done
-    while done * train.tuples_per_update < train.total_tuples and not stop.name:
+    while done * train.tuples_per_update < train.total_tuples:
+        if processes.anywhere(bool(stop.name)):
+            break
         before = time.perf_counter()
         state, report = update(state)
         metrics = _floats(report.metrics)
@@ -132,22 +135,29 @@ def _loop(run: Run, progress: logs.Progress, stop: StopSignal) -> TrainResult:
             "tuples": done * train.tuples_per_update,
             "tuples_per_second": train.tuples_per_update / (now - before),
             "seconds": now - began,
+            "devices": run.mesh.size,
         } | metrics
         at_checkpoint = done % train.checkpoint_interval == 0
         if at_checkpoint:
-            metrics |= _floats(measure_style(jax.device_get(state.running)))
-        log.write(metrics)
+            running = processes.on_host(state.running, run.mesh)
+            metrics |= _floats(measure_style(running))
+        if log is not None:
+            log.write(metrics)
         progress.show(metrics)
         if metrics["nan_count"] > nan_count:
             nan_count = int(metrics["nan_count"])
-            _dump(run.run_dir, done, report, progress.say)
+            incident = processes.on_host(report.incident, run.mesh)
+            if processes.is_first():
+                _dump(run.run_dir, done, incident, progress.say)
         if at_checkpoint:
             _save(run, done, state)
             saved = done
     if saved != done:
         _save(run, done, state)
-    log.close()
-    return _finish(run, done, state, stop, progress.say)
+    if log is not None:
+        log.close()
+    finished = done * train.tuples_per_update >= train.total_tuples
+    return _finish(run, done, state, finished, stop, progress.say)
 
 
 def _prepared(
@@ -185,7 +195,14 @@ def _first_state(
         if found is not None:
             update, arrays = found
             say(f"resuming {run.run_dir} after update {update}")
-            return jax.device_put(arrays, learner.state_shardings(run.mesh, arrays))
+            had = logs.read(run.run_dir)[update - 1].get("devices", run.mesh.size)
+            if had != run.mesh.size:
+                say(
+                    f"it had {had:.0f} devices and goes on with {run.mesh.size}: from "
+                    "here on it is another run"
+                )
+            shardings = learner.state_shardings(run.mesh, arrays)
+            return processes.to_devices(arrays, shardings)
     return init(key, None)
 
 
@@ -202,7 +219,9 @@ def _lowered(run: Run, template: TrainState) -> jax.stages.Lowered:
 
 
 def _save(run: Run, done: int, state: TrainState) -> None:
-    host = jax.device_get(state)
+    host = processes.on_host(state, run.mesh)
+    if not processes.is_first():
+        return
     checkpoint.save(run.run_dir, done, host, run.config.train.keep_checkpoints)
     checkpoint.save_policy(run.run_dir, _policy(host))
 
@@ -219,12 +238,13 @@ def _finish(
     run: Run,
     done: int,
     state: TrainState,
+    finished: bool,
     stop: StopSignal,
     say: Callable[[str], None],
 ) -> TrainResult:
-    if stop.name:
+    if not finished:
         say(
-            f"stopped by {stop.name} after update {done}; saved, "
+            f"stopped by {stop.name or 'another process'} after update {done}; saved, "
             f"continue with --resume --run-dir {run.run_dir}"
         )
     else:
@@ -233,22 +253,21 @@ def _finish(
     if said := verdict(metrics):
         say(said)
     return TrainResult(
-        params=_policy(jax.device_get(state)),
+        params=_policy(processes.on_host(state, run.mesh)),
         metrics=metrics,
         run_dir=run.run_dir,
-        finished=not stop.name,
+        finished=finished,
     )
 
 
 def _dump(
-    run_dir: Path, done: int, report: UpdateReport, say: Callable[[str], None]
+    run_dir: Path, done: int, incident: Incident, say: Callable[[str], None]
 ) -> None:
     """Keeps the state and action from which an environment broke."""
     folder = run_dir / "nan"
     folder.mkdir(exist_ok=True)
     if len(list(folder.iterdir())) >= _MAX_DUMPS:
         return
-    incident = jax.device_get(report.incident)
     broken = int(np.argmax(incident.happened))
     one = jax.tree.map(lambda x: x[broken], incident)
     path = folder / f"update-{done:09d}.npz"

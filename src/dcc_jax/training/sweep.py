@@ -104,6 +104,8 @@ def sweep(
     """
     runtime.ensure(quiet=quiet)
     settings = plan.settings_of(config, seeds, alpha)
+    if jax.process_count() > 1:
+        raise ValueError("a sweep is of one process; executor=... starts others")
     if executor is not None:
         return _as_jobs(executor, config, settings, run_dir, resume, environment, quiet)
     prepared = _prepare(config, settings, run_dir, resume, environment)
