@@ -30,7 +30,7 @@ RATE = 15.0  # pictures a second
 def shown(name: str, camera: tuple[float, ...], seed: int) -> list[np.ndarray]:
     """The pictures of a skill at its greatest alpha."""
     gif = Path(f"{name}.gif")  # is not written; it says that nothing else is
-    plan = film.prepare(name, None, SECONDS, None, seed, None, None, gif, camera)
+    plan = film.prepare(name, seconds=SECONDS, seed=seed, gif=gif, camera=camera)
     plan = dataclasses.replace(plan, size=(2 * WIDTH, 2 * WIDTH))
     every = round(CONTROL_RATE / RATE)
     images = itertools.islice(film.play(plan).images, 0, None, every)

@@ -16,6 +16,7 @@ import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -105,6 +106,8 @@ def stood_in(monkeypatch: pytest.MonkeyPatch) -> None:
         real = getattr(dcc_jax, name)
         monkeypatch.setattr(dcc_jax, name, checked(real, result))
     monkeypatch.setattr("dcc_jax.play.program.Program", Still)
+    for name in ("ray", "submitit"):  # which the project does without
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
 
 
 def emptied(kind: type) -> dict[str, Any]:

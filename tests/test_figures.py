@@ -212,3 +212,22 @@ def test_table_of_soft_contacts_has_the_effect_of_u_alone():
         "0%",
     ]
     assert cells == expected
+
+
+def test_steps_of_feet_that_take_turns_and_of_one_that_drags():
+    speeds = importlib.import_module("locomotion_speeds")
+    time = np.arange(0.0, 4.0, 1 / 30)
+    walking = speeds._steps(0.3 * np.sin(2 * np.pi * time))
+    assert walking == [1, -1, 1, -1, 1, -1, 1, -1]
+    assert speeds._alternate(walking) == 1.0
+    limping = speeds._steps(0.3 * np.abs(np.sin(np.pi * time)))
+    assert limping == [1, 1, 1, 1] and speeds._alternate(limping) == 0.0
+    assert speeds._steps(np.full(50, 0.02)) == []
+
+
+def test_error_of_a_speed_is_of_means_over_a_second():
+    speeds = importlib.import_module("locomotion_speeds")
+    time = np.arange(0.0, 5.0, 1 / 30)[:, None]
+    along = 2.0 + 0.4 * np.sin(2 * np.pi * 2.0 * time)  # rocks twice a second
+    assert speeds._error(along, 2.0) < 1e-2
+    assert speeds._error(along + 0.3, 2.0) == pytest.approx(0.3, rel=1e-3)

@@ -41,7 +41,7 @@ def plan(push: Path, tmp_path_factory: pytest.TempPathFactory) -> film.FilmPlan:
     mp4, png, gif = folder / "new" / "a.mp4", folder / "a.png", folder / "a.gif"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(film, "Player", smoke.player)
-        plan = film.prepare(push, mp4, SECONDS, None, 3, png, None, gif)
+        plan = film.prepare(push, out=mp4, seconds=SECONDS, seed=3, strip=png, gif=gif)
     return dataclasses.replace(plan, size=(320, 240))
 
 

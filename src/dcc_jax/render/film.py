@@ -92,21 +92,31 @@ def render(
         ModuleNotFoundError: the `video` extra is not installed.
     """
     plan = prepare(
-        run_dir, out, seconds, alpha, seed, strip, task, gif, tuple(camera), slow
+        run_dir,
+        out=out,
+        seconds=seconds,
+        alpha=alpha,
+        seed=seed,
+        strip=strip,
+        task=task,
+        gif=gif,
+        camera=camera,
+        slow=slow,
     )
     write(plan, play(plan))
 
 
 def prepare(
     run_dir: str | Path,
-    out: str | Path | None,
-    seconds: float,
-    alpha: float | None,
-    seed: int,
-    strip: str | Path | None,
-    task: Mapping[str, Any] | Task | None,
+    *,
+    out: str | Path | None = None,
+    seconds: float = 8.0,
+    alpha: float | None = None,
+    seed: int = 0,
+    strip: str | Path | None = None,
+    task: Mapping[str, Any] | Task | None = None,
     gif: str | Path | None = None,
-    camera: tuple[float, ...] = (),
+    camera: Sequence[float] = (),
     slow: float = 1.0,
 ) -> FilmPlan:
     """Checks everything a user can get wrong; arguments as of `render`."""
@@ -114,6 +124,7 @@ def prepare(
         raise ValueError(f"seconds must be in [0.1, 3600], got {seconds}")
     if not 0 <= seed < 2**32:
         raise ValueError(f"seed must be between 0 and 2^32 - 1, got {seed}")
+    camera = tuple(camera)
     _check_camera(camera)
     if not 1.0 <= slow <= SLOWEST:
         raise ValueError(f"slow must be in [1, {SLOWEST:g}], got {slow}")

@@ -10,8 +10,9 @@ is carried off: it goes on from within `leash` of the character.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import flax.struct
 import jax
@@ -50,6 +51,7 @@ class Locomotion(Task):
     )
     state_size: ClassVar[int] = SEEN
     trackable: ClassVar[bool] = False
+    config_overrides: ClassVar[Mapping[str, Any]] = {"ppo.sigma_degrees": 3.0}
 
     gaits: Gaits = field(
         default_factory=lambda: Gaits(speeds=(0.0, 0.8, 1.2, 1.6, 2.0, 2.5, 3.0))
