@@ -12,11 +12,9 @@ FRESH := $(if $(wildcard $(VENV)/lib/python$(VERSION)),,--clear)
 # pip stops where there is no home directory, as under many service accounts.
 HOME ?= $(CURDIR)/$(VENV)
 export HOME
-# `make run`: about five minutes of learning on two cores, at levels of compliance that
-# are learned in that time (0.16 takes half an hour).
-RUN := runs/trampoline-$(shell date +%Y%m%d-%H%M%S)
-TUPLES := 1638400
-LEVELS := --env.alpha 0 --env.alpha-max 0.04
+# `make run`: about three minutes of learning on two cores.
+RUN := runs/door-$(shell date +%Y%m%d-%H%M%S)
+LEARN := --task door --env.alpha 0 --env.alpha-max 0.8 --train.total-tuples 1638400
 
 # Tests that share a compiled program run on one worker (tests/conftest.py).
 WORKERS := -n auto --dist loadgroup --no-loadscope-reorder
@@ -38,10 +36,10 @@ view: setup
 	$(BIN)/python -m dcc_jax.view $(POLICY)
 
 run: setup
-	$(BIN)/python -m dcc_jax.train --task trampoline $(LEVELS) --train.total-tuples $(TUPLES) --run-dir $(RUN)
-	$(BIN)/python -m dcc_jax.render $(RUN) --seconds 12 --out $(RUN)/policy.mp4
+	$(BIN)/python -m dcc_jax.train $(LEARN) --run-dir $(RUN)
+	$(BIN)/python -m dcc_jax.render $(RUN) --seconds 5 --out $(RUN)/policy.mp4
 	@echo "curves: $(RUN)/curves.png   video: $(RUN)/policy.mp4   go on: \
-	$(BIN)/python -m dcc_jax.train --task trampoline $(LEVELS) --resume --run-dir $(RUN)"
+	$(BIN)/python -m dcc_jax.train $(LEARN) --train.total-tuples 4000000 --resume --run-dir $(RUN)"
 	@echo "pull what was learned, in a browser:   make view POLICY=$(RUN)"
 
 test: setup

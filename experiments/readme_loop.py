@@ -17,8 +17,8 @@ from dcc_jax.render import film, pictures
 from dcc_jax.viz import files
 
 SKILLS = {
-    "push": ((125.0, -8.0, 3.3), 1),
-    "trampoline": ((125.0, -8.0, 4.2), 0),
+    "door": ((20.0, -10.0, 3.6), 0),
+    "ball": ((125.0, -4.0, 4.2), 1),
     "hand-in-hand": ((150.0, -8.0, 3.8), 3),
 }
 """Camera (azimuth and elevation in degrees, distance in m) and seed of each."""
