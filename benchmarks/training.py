@@ -183,7 +183,8 @@ def first_update(config: Config, cache: str) -> float:
     """Seconds from the command to the first line of metrics, in a fresh process."""
     with tempfile.TemporaryDirectory() as folder:
         run_dir = Path(folder) / "run"
-        command = [sys.executable, "-m", "dcc_jax.train", "--task", config.task]
+        command: list[str] = [sys.executable, "-m", "dcc_jax.train"]
+        command += ["--task", config.task.name]
         command += ["--preset", config.preset, "--run-dir", str(run_dir)]
         environ = os.environ | {"DCC_JAX_CACHE": cache}
         begin = time.perf_counter()
