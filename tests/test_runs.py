@@ -63,5 +63,5 @@ def test_parameters_that_make_no_sense_are_named(wide, task, said):
 
 def test_one_level_of_compliance_needs_no_sequence(wide):
     assert [c.alpha for _, c in _plan(wide, alpha=0.1).conditions] == [0.1]
-    with pytest.raises(ValueError, match=r"alpha must be in \[0, 1\], got 2"):
+    with pytest.raises(ValueError, match=r"alpha must be in \[0, 0.9\], got 2"):
         _plan(wide, alpha=2)

@@ -228,9 +228,10 @@ def test_known_policies_begin_with_push_and_end_with_those_under_runs(
     tmp_path, monkeypatch
 ):
     from dcc_jax.play.runs import known_runs
+    from dcc_jax.tasks import TASKS
 
     shutil.copytree(asset_path("policies/push"), tmp_path / "runs" / "mine")
     monkeypatch.chdir(tmp_path)
     known = known_runs()
     assert known[0] == "push" and known[-1] == str(Path("runs", "mine"))
-    assert len(known) == 9
+    assert len(known) == len(TASKS) + 1
