@@ -12,6 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
+from dcc_jax import runtime
+
+if __name__ == "__main__":
+    runtime.ensure()
+
 from dcc_jax.env.config import CONTROL_RATE
 from dcc_jax.render import film, pictures
 from dcc_jax.viz import files
