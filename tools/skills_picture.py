@@ -16,11 +16,12 @@ MOMENTS = {
     "push": (2, 1),
     "trampoline": (0, 3),
     "backflip": (0, 3),
-    "door": (1, 1),
+    "door": (2, 0),
     "hand-in-hand": (2, 2),
-    "ball": (2, 3),
+    "ball": (1, 0),
     "chicken-fight": (1, 3),
     "sustained-push": (2, 2),
+    "locomotion": (1, 2),
 }
 """Row and column in the strip of each skill, chosen by eye."""
 
@@ -34,9 +35,9 @@ def moment(skill: str) -> np.ndarray:
 
 
 def main() -> None:
-    """Two rows of four."""
+    """Three rows of three."""
     pictures = [moment(skill) for skill in MOMENTS]
-    rows = [np.concatenate(pictures[i : i + 4], axis=1) for i in (0, 4)]
+    rows = [np.concatenate(pictures[i : i + 3], axis=1) for i in (0, 3, 6)]
     imsave(DOCS / "skills.png", np.concatenate(rows))
 
 
