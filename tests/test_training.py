@@ -154,3 +154,16 @@ def test_environment_that_breaks_is_counted_and_dumped(tmp_path):
         assert dump["env.obs"].shape == (3,) and dump["action"].shape == (2,)
     kernel = result.params.params.layers[0].kernel
     assert np.isfinite(kernel).all()
+
+
+def test_run_whose_metrics_were_lost_goes_on(tmp_path):
+    for updates in (INTERVAL, INTERVAL + 2):
+        result = loop.train(
+            toy_config(updates),
+            run_dir=tmp_path / "run",
+            resume=updates > INTERVAL,
+            environment=Toy(),
+            quiet=True,
+        )
+        (result.run_dir / "metrics.jsonl").unlink()
+    assert [row["update"] for row in result.metrics] == [INTERVAL + 1, INTERVAL + 2]

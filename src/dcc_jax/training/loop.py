@@ -195,7 +195,9 @@ def _first_state(
         if found is not None:
             update, arrays = found
             say(f"resuming {run.run_dir} after update {update}")
-            had = logs.read(run.run_dir)[update - 1].get("devices", run.mesh.size)
+            kept = (run.run_dir / "metrics.jsonl").exists()
+            rows = logs.read(run.run_dir)[:update] if kept else []
+            had = rows[-1].get("devices", run.mesh.size) if rows else run.mesh.size
             if had != run.mesh.size:
                 say(
                     f"it had {had:.0f} devices and goes on with {run.mesh.size}: from "
