@@ -18,7 +18,7 @@ from still import Still
 pytest.importorskip("viser")
 
 from dcc_jax.view import __main__ as command
-from dcc_jax.view import saving, server, viewer
+from dcc_jax.view import saving, server, status, viewer
 from dcc_jax.view.plots import CHARTS, data
 
 
@@ -195,6 +195,26 @@ def test_sign_that_the_machine_cannot_keep_up(live):
     assert "cannot keep up" in live.status_text()
     live.real_time_factor = 1.0
     assert "cannot keep up" not in live.status_text()
+
+
+def test_meter_counts_from_its_beginning_and_waits_for_a_second(monkeypatch):
+    monkeypatch.setattr(status, "time", SimpleNamespace(perf_counter=lambda: 10.0))
+    meter = status.Meter(0.5)
+    assert meter.factor(10.5) == 0.5
+    meter.count(0.6)
+    assert meter.factor(11.5) == pytest.approx(0.4)
+
+
+def test_pause_is_not_taken_for_a_machine_that_cannot_keep_up(live):
+    live.panel.paused.value = True
+    until(lambda: "paused" in live.status_text())
+    time.sleep(1.5)  # most of what a meter looks back on
+    live.panel.paused.value = False
+    steps = len(live.simulation.history)
+    until(lambda: "paused" not in live.status_text())
+    until(lambda: live.real_time_factor > 0.0)
+    assert "cannot keep up" not in live.status_text()
+    assert len(live.simulation.history) >= steps
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import numpy as np
 from dcc_jax.play.simulation import Simulation
 
 KEEPS_UP = 0.95  # share of the speed asked for below which it does not keep up
+SETTLES = 1.0  # s: a shorter time says nothing about the speed
 
 
 def text(
@@ -67,7 +68,13 @@ def _numbers(simulation: Simulation, factor: float, wanted: float) -> list[str]:
 class Meter:
     """How fast the simulated time goes against the clock, over the last two seconds."""
 
-    def __init__(self) -> None:
+    def __init__(self, wanted: float) -> None:
+        """Begins anew: after a pause, or where another speed is asked for.
+
+        Args:
+            wanted: simulated seconds a second that are asked for.
+        """
+        self.wanted = wanted
         self._counted = 0.0
         self._marks = [(time.perf_counter(), 0.0)]
 
@@ -76,8 +83,10 @@ class Meter:
         self._counted += seconds
 
     def factor(self, now: float) -> float:
-        """Simulated seconds a second."""
+        """Simulated seconds a second; what is asked for until a second is over."""
         self._marks = [m for m in self._marks if now - m[0] < 2.0] or self._marks[-1:]
         since, counted = self._marks[0]
         self._marks.append((now, self._counted))
-        return (self._counted - counted) / max(now - since, 1e-3)
+        if now - since < SETTLES:
+            return self.wanted
+        return (self._counted - counted) / (now - since)

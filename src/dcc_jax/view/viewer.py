@@ -76,7 +76,7 @@ class Viewer:
         self._single = False
         self._loading: tuple[str, float] | None = None
         self._stop = threading.Event()
-        self._meter = status.Meter()
+        self._meter = status.Meter(1.0)
         self.panel = Panel(self, server)
         server.initial_camera.position = (1.7, -2.0, 1.3)
         server.initial_camera.look_at = (0.0, 0.0, 0.85)
@@ -151,6 +151,8 @@ class Viewer:
         while not self._stop.is_set():
             self._answer()
             now = time.perf_counter()
+            if self._meter.wanted != self._wanted:
+                self._meter = status.Meter(self._wanted)
             if self._moves():
                 self._guarded(self._step)
                 period = PERIOD / max(self.panel.speed.value, 0.05)
@@ -166,6 +168,13 @@ class Viewer:
                 plotted = now
                 self._guarded(self._show_plots)
             time.sleep(max(0.0, due - time.perf_counter()))
+
+    @property
+    def _wanted(self) -> float:
+        """Simulated seconds a second that are asked for."""
+        if self._loading is not None or self.panel.paused.value:
+            return 0.0
+        return float(self.panel.speed.value)
 
     def _moves(self) -> bool:
         if self.simulation is None or self._loading is not None:
@@ -298,7 +307,6 @@ class Viewer:
         self.name, self.simulation, self._loading = began[0], simulation, None
         while len(self._programs) > PROGRAMS:
             self._programs.pop(next(iter(self._programs)))
-        self._meter = status.Meter()
         self.panel.policy.value = self.name
         self.panel.of_policy(simulation)
 
@@ -315,9 +323,12 @@ class Viewer:
         if self._loading is not None:
             name, since = self._loading
             loading = name, time.perf_counter() - since
-        wanted = 0.0 if self.panel.paused.value else float(self.panel.speed.value)
         return status.text(
-            self.note, loading, self.simulation, self.real_time_factor, wanted
+            self.note,
+            loading,
+            self.simulation,
+            self.real_time_factor,
+            self._meter.wanted,
         )
 
     def _save(
