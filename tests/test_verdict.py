@@ -27,11 +27,14 @@ def test_nothing_is_said_before_anything_is_measured():
         ([0.02, 0.01], ""),
     ],
 )
-def test_distance_is_told_in_floors_with_its_trend(nearest, trend):
-    said = verdict(_rows(nearest))
-    away = nearest[-1] / 0.004
-    expected = f"the motion is {away:.1f} times the floor away from its clips"
-    assert said == f"{expected} ({1e3 * nearest[-1]:.0f} mm){trend}"
+def test_distance_is_told_with_its_trend(nearest, trend):
+    expected = f"the motion is {1e3 * nearest[-1]:.0f} mm away from its clips"
+    assert verdict(_rows(nearest)) == expected + trend
+
+
+def test_distance_is_told_in_floors_where_a_discriminator_learns():
+    said = verdict(_rows([0.02, 0.01], margin=0.5))
+    assert said == "the motion is 10 mm away from its clips, 2.5 times the floor"
 
 
 @pytest.mark.parametrize(("margin", "won"), [(1.8, True), (1.2, False)])

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from dcc_jax.learn.rollout import Environment
+from dcc_jax.learn.rollout import Environment, Policy
 from dcc_jax.learn.state import (
     AXIS,
     LearnerConfig,
@@ -62,7 +62,11 @@ def check_sizes(config: LearnerConfig, devices: int) -> None:
 
 
 def make_init(
-    environment: Environment, config: LearnerConfig, mesh: Mesh, runs: bool = False
+    environment: Environment,
+    config: LearnerConfig,
+    mesh: Mesh,
+    runs: bool = False,
+    start: Policy | None = None,
 ) -> Init:
     """The function (key, alpha) -> TrainState, compiled for the mesh.
 
@@ -71,12 +75,13 @@ def make_init(
         config: sizes and rates.
         mesh: of `make_mesh`.
         runs: keys and alphas carry a leading axis [R], and so does the state.
+        start: the policy they begin with; None: as the configuration says.
     """
     check_sizes(config, mesh.size)
     local_envs = config.train.num_envs // mesh.size
 
     def init(key: Array, alpha: Array | None) -> TrainState:
-        return init_state(key, alpha, environment, config, local_envs)
+        return init_state(key, alpha, environment, config, local_envs, start)
 
     body = jax.vmap(init) if runs else init
     sharded = jax.shard_map(

@@ -5,6 +5,7 @@ Letters: B environments of this device, D devices.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -17,7 +18,7 @@ from dcc_jax.learn import discriminator, networks, normalizer, ppo, warm_start
 from dcc_jax.learn.discriminator import DiscriminatorConfig
 from dcc_jax.learn.exchange import all_gather_tree
 from dcc_jax.learn.ppo import PpoConfig
-from dcc_jax.learn.rollout import Environment, Incident, Running, reset_all
+from dcc_jax.learn.rollout import Environment, Incident, Policy, Running, reset_all
 
 Array = jax.Array
 AXIS = "env"  # mesh axis over which the environments are sharded
@@ -45,6 +46,10 @@ class TrainConfig:
     warm_start_steps: int = 500
     """Supervised steps in which the policy learns to lead along the clips before its
     first update; 0: it begins with random weights, as in the paper."""
+
+    start_from: str | None = None
+    """A run directory or the name of a policy that ships, whose policy this training
+    begins with, in place of the warm start; the value function begins anew."""
 
     checkpoint_interval: int = 50
     """Updates between checkpoints; one is also written at the end and on a signal."""
@@ -129,6 +134,7 @@ def init_state(
     environment: Environment,
     config: LearnerConfig,
     local_envs: int,
+    start: Policy | None = None,
 ) -> TrainState:
     """A run before its first update, seen from one device of the mesh axis.
 
@@ -138,6 +144,7 @@ def init_state(
         environment: of the task.
         config: sizes.
         local_envs: B.
+        start: the policy it begins with; None: a warm start, or random weights.
     """
     key, agent_key, disc_key, reset_key, expert_key, warm_key = jax.random.split(key, 6)
     lesson_key, moments_key = jax.random.split(of_device(warm_key))
@@ -147,20 +154,25 @@ def init_state(
     agent = ppo.init_agent(
         agent_key, environment.observation_size, environment.action_size, config.ppo
     )
-    if config.train.warm_start_steps:
+    lessons = 0 if start is not None else config.train.warm_start_steps
+    if lessons:
         keys = jax.random.split(moments_key, config.train.unroll_length * local_envs)
         obs, _ = jax.vmap(environment.expert_action)(keys)
     obs_normalizer = normalizer.pooled(all_gather_tree(normalizer.moments(obs), AXIS))
-    if config.train.warm_start_steps:
+    if lessons:
         agent = warm_start.warm_start(
             lesson_key,
             agent,
             obs_normalizer,
             environment,
             config.ppo,
-            config.train.warm_start_steps,
+            lessons,
             AXIS,
         )
+    if start is not None:
+        policy = dataclasses.replace(agent.policy, params=start.params)
+        agent = dataclasses.replace(agent, policy=policy)
+        obs_normalizer = start.normalizer
     s, _, _ = environment.expert_pairs(expert_key, _EXPERT_SAMPLE)
     width = 2 * environment.feature_size + environment.condition_size
     disc = networks.init_mlp(disc_key, (width, *config.disc.hidden, 1))

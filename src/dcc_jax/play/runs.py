@@ -41,12 +41,7 @@ def find_run(name: str | Path) -> Run:
     Raises:
         ValueError: there is none, or it is damaged, or there are the many of a sweep.
     """
-    path = Path(name)
-    if not path.exists():
-        path = _shipped(str(name))
-    if (path / folder.SWEEP).exists():
-        within = ", ".join(sorted(p.parent.name for p in path.glob("*/policy.npz")))
-        raise ValueError(f"{name} is a sweep; its runs are {within or 'not begun'}")
+    path = folder.find(name)
     return Run(str(name), config.load(path), checkpoint.load_policy(path))
 
 
@@ -59,22 +54,6 @@ def known_runs() -> list[str]:
     shipped.sort(key=lambda name: (order.index(name) if name in order else 99, name))
     own = sorted(str(p.parent) for p in Path("runs").glob("**/policy.npz"))
     return shipped + own
-
-
-def _shipped(name: str) -> Path:
-    """The directory of a policy that ships: `push` and `assets/policies/push` alike."""
-    try:
-        folder = asset_path("policies")
-        known = sorted(entry.name for entry in folder.iterdir())
-    except FileNotFoundError:
-        folder, known = Path(), []
-    if Path(name).name in known and Path(name).parts[:-1] in (
-        (),
-        ("assets", "policies"),
-    ):
-        return folder / Path(name).name
-    ships = f"; policies that ship: {', '.join(known)}" if known else ""
-    raise ValueError(f"{name} is not a run directory{ships}")
 
 
 def make_environment(

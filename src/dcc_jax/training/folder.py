@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 
 from dcc_jax import config
+from dcc_jax.character import asset_path
 from dcc_jax.config import Config
 from dcc_jax.training import checkpoint
 
@@ -21,6 +22,21 @@ class RunError(RuntimeError):
 def default_run_dir(task: str) -> Path:
     """`runs/<task>-<date>-<time>` in the working directory."""
     return Path("runs") / f"{task}-{time.strftime('%Y%m%d-%H%M%S')}"
+
+
+def find(name: str | Path) -> Path:
+    """The directory of a policy: a run's, or that of one that ships, by path or name.
+
+    Raises:
+        ValueError: there is none, or there are the many of a sweep.
+    """
+    path = Path(name)
+    if not path.exists():
+        path = _shipped(str(name))
+    if (path / SWEEP).exists():
+        within = ", ".join(sorted(p.parent.name for p in path.glob("*/policy.npz")))
+        raise ValueError(f"{name} is a sweep; its runs are {within or 'not begun'}")
+    return path
 
 
 def check(run_dir: Path, wanted: Config, resume: bool) -> None:
@@ -54,6 +70,22 @@ def begin(run_dir: Path, wanted: Config) -> None:
             f"run_dir {run_dir} cannot be written ({error.strerror}); "
             "--run-dir DIR names another place"
         ) from None
+
+
+def _shipped(name: str) -> Path:
+    """The directory of a policy that ships: `push` and `assets/policies/push` alike."""
+    try:
+        folder = asset_path("policies")
+        known = sorted(entry.name for entry in folder.iterdir())
+    except FileNotFoundError:
+        folder, known = Path(), []
+    if Path(name).name in known and Path(name).parts[:-1] in (
+        (),
+        ("assets", "policies"),
+    ):
+        return folder / Path(name).name
+    ships = f"; policies that ship: {', '.join(known)}" if known else ""
+    raise ValueError(f"{name} is not a run directory{ships}")
 
 
 def _check_whole(run_dir: Path) -> None:

@@ -19,6 +19,7 @@ from dcc_jax.learn.rollout import Environment, Incident, Policy
 from dcc_jax.learn.state import TrainState
 from dcc_jax.training import checkpoint, folder, logs, processes
 from dcc_jax.training.folder import RunError, default_run_dir
+from dcc_jax.training.start import starting_policy
 from dcc_jax.training.stop import StopSignal
 from dcc_jax.training.verdict import verdict
 
@@ -44,6 +45,7 @@ class Run:
     environment: Environment
     mesh: jax.sharding.Mesh
     resume: bool
+    start: Policy | None  # that it begins with, in place of a warm start
 
 
 def train(
@@ -94,8 +96,10 @@ def prepare(
         environment = make_environment(wanted)
     mesh = learner.make_mesh(wanted.train)
     learner.check_sizes(wanted, mesh.size)
+    first = not (resume and checkpoint.available(place))
+    start = starting_policy(wanted, environment) if first else None
     processes.by_the_first(lambda: folder.begin(place, wanted))
-    return Run(wanted, place, environment, mesh, resume)
+    return Run(wanted, place, environment, mesh, resume, start)
 
 
 def execute(run: Run, *, quiet: bool = False) -> TrainResult:
@@ -171,7 +175,7 @@ def _prepared(
     """
     say(f"compiling for {run.mesh.size} {jax.default_backend()} device(s) ...")
     began = time.perf_counter()
-    init = learner.make_init(run.environment, run.config, run.mesh)
+    init = learner.make_init(run.environment, run.config, run.mesh, start=run.start)
     template = jax.eval_shape(init, jax.random.key(run.config.seed), None)
     lowered = _lowered(run, template)
     with ThreadPoolExecutor(1) as beside:

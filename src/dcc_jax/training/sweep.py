@@ -26,6 +26,7 @@ from dcc_jax.learn.state import TrainState
 from dcc_jax.learn.update import chunk_size
 from dcc_jax.training import checkpoint, folder, jobs, logs, plan
 from dcc_jax.training.loop import make_environment
+from dcc_jax.training.start import starting_policy
 from dcc_jax.training.stop import StopSignal
 
 
@@ -63,6 +64,7 @@ class _Sweep:
     environment: Environment
     mesh: jax.sharding.Mesh
     resume: bool
+    start: Policy | None  # that every run begins with
 
     @property
     def settings(self) -> list[plan.Setting]:
@@ -159,8 +161,10 @@ def _prepare(
     mesh = learner.make_mesh(wanted.train)
     config = _chunked(wanted, mesh.size, len(settings))
     learner.check_sizes(config, mesh.size)
+    first = not (resume and checkpoint.available(run_dir))
+    start = starting_policy(wanted, environment) if first else None
     runs = plan.begin(wanted, settings, run_dir)
-    return _Sweep(config, runs, run_dir, environment, mesh, resume)
+    return _Sweep(config, runs, run_dir, environment, mesh, resume, start)
 
 
 def _loop(sweep: _Sweep, progress: logs.Progress, stop: StopSignal) -> SweepResult:
@@ -203,7 +207,9 @@ def _first_state(sweep: _Sweep, say: Callable[[str], None]) -> tuple[int, TrainS
     keys = jnp.stack([jax.random.key(seed) for seed, _ in sweep.settings])
     levels = [level for _, level in sweep.settings]
     alpha = None if levels[0] is None else jnp.array(levels)
-    init = learner.make_init(sweep.environment, sweep.config, sweep.mesh, runs=True)
+    init = learner.make_init(
+        sweep.environment, sweep.config, sweep.mesh, runs=True, start=sweep.start
+    )
     if sweep.resume:
         template = jax.eval_shape(init, keys, alpha)
         found = checkpoint.restore_latest(sweep.run_dir, template, say)

@@ -25,10 +25,12 @@ def verdict(rows: Sequence[dict[str, float]]) -> str:
     measured = [row for row in rows if row.get("style/floor")]
     if not measured:
         return ""
-    away = [row["style/nearest"] / row["style/floor"] for row in measured]
-    text = f"the motion is {away[-1]:.1f} times the floor away from its clips"
-    text += f" ({1e3 * measured[-1]['style/nearest']:.0f} mm)" + _trend(away)
+    nearest = [row["style/nearest"] for row in measured]
     margin = [row["disc/margin"] for row in rows[-50:] if "disc/margin" in row]
+    text = f"the motion is {1e3 * nearest[-1]:.0f} mm away from its clips"
+    if margin:  # a reference that is followed in time has a floor of next to nothing
+        text += f", {nearest[-1] / measured[-1]['style/floor']:.1f} times the floor"
+    text += _trend(nearest)
     if margin and fmean(margin) > WON:
         text += (
             f"; the discriminator has won (it scores clips {fmean(margin):.1f} of 2 "
