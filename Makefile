@@ -30,8 +30,9 @@ $(STAMP): pyproject.toml $(CONSTRAINTS)
 	$(BIN)/pip install --quiet -c $(CONSTRAINTS) -e ".[dev,video,view]"
 	touch $(STAMP)
 
-# Another policy: `make view POLICY=door`, or a run directory.
-POLICY ?= push
+# A character that walks and has learned to bear a pull. Another policy:
+# `make view POLICY=door`, or a run directory.
+POLICY ?= sustained-push
 view: setup
 	$(BIN)/python -m dcc_jax.view $(POLICY)
 

@@ -16,6 +16,8 @@ from dcc_jax import command
 from dcc_jax.play import overrides
 
 PROGRAM = "dcc_jax.view"
+FIRST = "sustained-push"
+"""The policy that is shown where none is named: it has learned to bear a pull."""
 MISSING = "the viewer needs {}: pip install 'dcc-jax[view]'"
 
 
@@ -27,7 +29,7 @@ class Options:
 
     run_dir: Annotated[
         Positional[str | None],
-        arg(metavar="[RUN_DIR]", help_behavior_hint="(default: the first that ships)"),
+        arg(metavar="[RUN_DIR]", help_behavior_hint=f"(default: {FIRST})"),
     ] = None
     """A run directory, or the name of a policy that ships."""
 
@@ -78,7 +80,7 @@ def _plan(options: Options) -> command.Work:
     from dcc_jax.play import runs
 
     known = runs.known_runs()
-    name = options.run_dir or known[0]
+    name = options.run_dir or (FIRST if FIRST in known else known[0])
     run = runs.find_run(name)
     task = overrides.changes(PROGRAM, name, options.task)
     return partial(_serve, options, run.name, known, port, task)
