@@ -35,7 +35,10 @@ class Options:
 
     alpha: Annotated[
         float | None,
-        arg(metavar="A", help_behavior_hint="(default: the greatest of the training)"),
+        arg(
+            metavar="A",
+            help_behavior_hint="(default: that of the training, at most 0.5)",
+        ),
     ] = None
     """Level of compliance at first."""
 

@@ -32,6 +32,7 @@ STATUS_EVERY = 0.25  # s
 PLOTS_EVERY = 1.0  # s
 LATE = 0.25  # s behind, from which on time that is lost is not made up for
 PROGRAMS = 3  # that are kept: going back to a skill is then immediate
+FIRST_ALPHA = 0.5  # at most: what is softer gives way farther, and falls more often
 LARGEST_FORCE = 1000.0  # N, that a mouse can pull with
 
 
@@ -56,7 +57,8 @@ class Viewer:
             name: of the first policy.
             known: names of all that can be chosen.
             seed: of everything that is drawn.
-            alpha: level of compliance at first; None: the greatest of the training.
+            alpha: level of compliance at first; None: the greatest of the training, at
+                most `FIRST_ALPHA`.
             task: parameters of the first policy's task.
             out: folder for what is saved.
         """
@@ -301,8 +303,12 @@ class Viewer:
     def _loaded(self, began: tuple[str, float], simulation: Simulation) -> None:
         if began is not self._loading:
             return
+        low, high = simulation.run.alphas
+        alpha = max(low, min(high, FIRST_ALPHA))
         if self._alpha is not None:
-            simulation.alpha, self._alpha = self._alpha, None
+            alpha, self._alpha = self._alpha, None
+        if alpha != simulation.alpha:
+            simulation.alpha = alpha
             simulation.reset(episode=0)
         self.name, self.simulation, self._loading = began[0], simulation, None
         while len(self._programs) > PROGRAMS:
