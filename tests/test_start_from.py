@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dcc_jax import sweep
-from dcc_jax.learn import learner
+from dcc_jax.learn import learner, update
 from dcc_jax.training import checkpoint, loop
 from toy import Toy
 from toy_run import toy_config
@@ -64,14 +64,9 @@ def test_run_goes_on_when_its_start_is_gone(first, tmp_path):
 
 
 def test_every_run_of_a_sweep_begins_with_it(first, tmp_path):
-    def small_steps(start_from):
-        config = _config(1, start_from)
-        slow = dataclasses.replace(config.ppo, learning_rate=1e-9, target_kl=None)
-        return dataclasses.replace(config, ppo=slow)
-
     with jax.debug_key_reuse(False):  # as in test_sweep.py
         result = sweep(
-            small_steps(first),
+            _config(1, first),
             seeds=(0, 1),
             run_dir=tmp_path / "sweep",
             environment=Toy(),
@@ -79,10 +74,22 @@ def test_every_run_of_a_sweep_begins_with_it(first, tmp_path):
         )
     begun = checkpoint.load_policy(first)
     for policy in result.policies.values():
-        for new, old in zip(
-            jax.tree.leaves(policy.params), jax.tree.leaves(begun.params), strict=True
-        ):
-            np.testing.assert_allclose(new, old, atol=1e-6)
+        _same(policy.params, begun.params)
+
+
+def test_policy_waits_for_the_value_function(first, tmp_path, monkeypatch):
+    monkeypatch.setattr(update, "VALUE_FIRST", 2)
+    begun = checkpoint.load_policy(first)
+
+    def after(updates: int):
+        run_dir = tmp_path / f"{updates}"
+        config = _config(updates, first)
+        loop.train(config, run_dir=run_dir, environment=Toy(), quiet=True)
+        return checkpoint.load_policy(run_dir).params
+
+    _same(after(2), begun.params)
+    with pytest.raises(AssertionError):
+        _same(after(3), begun.params)
 
 
 @pytest.mark.parametrize(

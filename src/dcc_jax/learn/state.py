@@ -49,7 +49,8 @@ class TrainConfig:
 
     start_from: str | None = None
     """A run directory or the name of a policy that ships, whose policy this training
-    begins with, in place of the warm start; the value function begins anew."""
+    begins with, in place of the warm start. The value function begins anew, and the
+    policy waits for it for 50 updates."""
 
     checkpoint_interval: int = 50
     """Updates between checkpoints; one is also written at the end and on a signal."""

@@ -38,6 +38,8 @@ from dcc_jax.learn.state import (
 )
 
 Array = jax.Array
+VALUE_FIRST = 50
+"""Updates in which a policy that is not new waits for its value function."""
 
 # Environments whose working set stays in the cache of a core (design, section 2.5).
 _CPU_CHUNK = 128
@@ -80,6 +82,8 @@ def update_state(
     reward, of_reward = _rewards(state, taken.transitions, environment, config)
     batch = _ppo_batch(state, taken, reward, config.ppo)
     agent, of_ppo = ppo.update(of_device(ppo_key), state.agent, batch, config.ppo, AXIS)
+    if config.train.start_from is not None:
+        agent = _policy_waiting(state, agent)
     metrics |= of_reward | of_ppo
     episodes = _episodes(taken.transitions)
     metrics, seen, episodes = all_gather_tree((metrics, seen, episodes), AXIS)
@@ -90,6 +94,19 @@ def update_state(
     )
     incident = jax.tree.map(lambda x: x[None], taken.incident)
     return state, UpdateReport(metrics=metrics | of_episodes, incident=incident)
+
+
+def _policy_waiting(state: TrainState, agent: ppo.Agent) -> ppo.Agent:
+    """The new agent, whose policy stays what it was in the first updates.
+
+    The advantages of a value function that knows nothing yet would spoil it: without
+    this `chicken-fight` fell in half of its episodes after 3 M tuples, from none.
+    """
+    waits = state.update < VALUE_FIRST
+    policy = jax.tree.map(
+        lambda old, new: jnp.where(waits, old, new), state.agent.policy, agent.policy
+    )
+    return dataclasses.replace(agent, policy=policy)
 
 
 def _train_discriminator(
