@@ -191,6 +191,7 @@ def test_charts_end_now_and_are_empty_where_nothing_is_remembered(live):
 
 
 def test_sign_that_the_machine_cannot_keep_up(live):
+    until(lambda: "paused" not in live.status_text())
     live.real_time_factor = 0.5
     assert "cannot keep up" in live.status_text()
     live.real_time_factor = 1.0
