@@ -279,8 +279,8 @@ def test_a_character_moves_alike_at_any_mass():
             keys = jax.random.split(step_key, 30)
             return jax.lax.scan(step, state, (keys, actions))[1]
 
-        return play(jax.random.key(3))
+        return [play(jax.random.key(seed)) for seed in range(4)]
 
     light, heavy = played(MASS), played(85.0)
-    assert np.max(light[-1]) > 1.0, "N/kg: the box has touched it"
+    assert np.max([force for *_, force in light]) > 1.0, "N/kg: the box touched it"
     chex.assert_trees_all_close(light, heavy, atol=5e-3, rtol=5e-3)

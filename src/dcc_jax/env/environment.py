@@ -7,6 +7,7 @@ knows no task and no discriminator; both come from outside.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from typing import Any
 
@@ -82,6 +83,15 @@ class Environment:
         self.observation_size = observation.size(task, self.has_phase)
         self.feature_size = features.FEATURE_SIZE
         self.has_task_reward = task.has_reward
+        # Traced once, however many programs have it.
+        self._reset = jax.jit(self._begun)
+
+    def elsewhere(self, scene: physics.Scene, task: Task) -> Environment:
+        """The same in another scene, with a task for it."""
+        other = copy.copy(self)
+        other.scene, other.task = scene, task
+        other._reset = jax.jit(other._begun)
+        return other
 
     def reset(self, key: Array, alpha: Array | None = None) -> EnvState:
         """A new episode at a moment of the reference (Reference State Initialization).
@@ -90,8 +100,11 @@ class Environment:
             key: consumed.
             alpha: level of compliance; None draws what the configuration says.
         """
-        reference_key, task_key, alpha_key = jax.random.split(key, 3)
-        reference, start = self._drawn(reference_key)
+        return self._reset(key, alpha)
+
+    def _begun(self, key: Array, alpha: Array | None) -> EnvState:
+        reference_key, place_key, task_key, alpha_key = jax.random.split(key, 4)
+        reference, start = self._drawn(reference_key, place_key)
         task, qpos, qvel = self.task.reset(task_key, self.scene, start)
         body = physics.initial_state(self.scene, qpos, qvel)
         displacement = compliance.at_rest(self.kinematics.coords)
@@ -205,25 +218,23 @@ class Environment:
         condition = jax.vmap(observation.of_phase)(phase)
         return s, s_next, condition[:, : self.condition_size]
 
-    def expert_action(self, key: Array) -> tuple[Array, Array]:
-        """A moment of the clips and what leads on from there: obs [O], action [A]."""
-        state, task = self.reset(key), self.task
-        at = state.reference
+    def expert_action(self, state: EnvState) -> Array:
+        """What leads on along the clips from where an episode begins: action [A]."""
+        task, at = self.task, state.reference
         ahead = task.reference(self.references, state.task, at, self.expert_lead)
         tracks = self.tracks_reference
         base = self._following(at, state.task).qpos if tracks else self.nominal
         turn = expert.action(self.kinematics, base, ahead.qpos)
-        return state.obs, jnp.pad(turn, (0, task.extra_actions))
+        return jnp.pad(turn, (0, task.extra_actions))
 
     def style_coordinates(self, s: Array, s_next: Array) -> Array:
         """Pairs of features [..., 270] as points [..., 225] in m (`learn.style`)."""
         return pairs.pair_coordinates(s, s_next, CONTROL_DT)
 
-    def _drawn(self, key: Array) -> tuple[RefState, RefState]:
+    def _drawn(self, key: Array, place_key: Array) -> tuple[RefState, RefState]:
         """The moment of the reference an episode begins at, and the start beside it."""
-        clip_key, place_key = jax.random.split(key)
         begin = not self.config.random_start
-        reference = self.task.first_reference(clip_key, self.references, begin)
+        reference = self.task.first_reference(key, self.references, begin)
         if not self.follows_reference:
             reference = _at_origin(reference)
             return reference, reference

@@ -147,29 +147,22 @@ def init_state(
         local_envs: B.
         start: the policy it begins with; None: a warm start, or random weights.
     """
-    key, agent_key, disc_key, reset_key, expert_key, warm_key = jax.random.split(key, 6)
-    lesson_key, moments_key = jax.random.split(of_device(warm_key))
-    reset_keys = jax.random.split(of_device(reset_key), local_envs)
-    running = reset_all(reset_keys, environment, alpha)
-    obs = running.env.obs
+    key, agent_key, disc_key, reset_key, expert_key = jax.random.split(key, 5)
+    lessons = 0 if start is not None else config.train.warm_start_steps
+    a_lesson = max(warm_start.SAMPLES // jax.lax.axis_size(AXIS), 1)
+    running, obs, action = _begun(
+        of_device(reset_key), environment, alpha, local_envs, lessons * a_lesson
+    )
     agent = ppo.init_agent(
         agent_key, environment.observation_size, environment.action_size, config.ppo
     )
-    lessons = 0 if start is not None else config.train.warm_start_steps
+    # As much as an update sees, so that what comes later counts as much.
+    seen = obs[: config.train.unroll_length * local_envs]
+    obs_normalizer = normalizer.pooled(all_gather_tree(normalizer.moments(seen), AXIS))
     if lessons:
-        keys = jax.random.split(moments_key, config.train.unroll_length * local_envs)
-        obs, _ = jax.vmap(environment.expert_action)(keys)
-    obs_normalizer = normalizer.pooled(all_gather_tree(normalizer.moments(obs), AXIS))
-    if lessons:
-        agent = warm_start.warm_start(
-            lesson_key,
-            agent,
-            obs_normalizer,
-            environment,
-            config.ppo,
-            lessons,
-            AXIS,
-        )
+        obs = normalizer.normalize(obs_normalizer, obs)
+        obs, action = (x.reshape(lessons, -1, x.shape[-1]) for x in (obs, action))
+        agent = warm_start.warm_start(agent, obs, action, config.ppo, AXIS)
     if start is not None:
         policy = dataclasses.replace(agent.policy, params=start.params)
         agent = dataclasses.replace(agent, policy=policy)
@@ -190,6 +183,45 @@ def init_state(
         episode_length=jnp.zeros(()),
         fall_rate=jnp.zeros(()),
     )
+
+
+def _begun(
+    key: Array,
+    environment: Environment,
+    alpha: Array | None,
+    local_envs: int,
+    samples: int,
+) -> tuple[Running, Array, Array]:
+    """Environments at a reset, and demonstrations of what leads on from there.
+
+    One loop draws both, so that XLA compiles the reset once: the environments are those
+    of its last round.
+
+    Args:
+        key: of this device; consumed.
+        environment: of the task.
+        alpha: [] level of compliance, or None: the environment's own.
+        local_envs: B.
+        samples: demonstrations; 0: those of one round.
+
+    Returns:
+        The environments, and obs [N, O] and action [N, A] of the demonstrations.
+    """
+    size = max(local_envs, min(samples, warm_start.SAMPLES))
+    rounds = max(-(-samples // size), 1)
+    keys = jax.random.split(key, (rounds, size))
+
+    def one(_: Running, keys: Array) -> tuple[Running, tuple[Array, Array]]:
+        begun = reset_all(keys, environment, alpha)
+        action = jax.vmap(environment.expert_action)(begun.env)
+        return begun, (begun.env.obs, action)
+
+    shapes = jax.eval_shape(lambda: reset_all(keys[0], environment, alpha))
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    begun, shown = jax.lax.scan(one, nothing, keys)
+    obs, action = (x.reshape(rounds * size, x.shape[-1]) for x in shown)
+    count = samples or size
+    return jax.tree.map(lambda x: x[:local_envs], begun), obs[:count], action[:count]
 
 
 def of_device(key: Array) -> Array:

@@ -53,7 +53,8 @@ def update_state(
     The normalisers stay as they are until the end, so that the policy that acted and
     the one that learns see the same numbers.
     """
-    key, rollout_key, disc_key, ppo_key = jax.random.split(state.key, 4)
+    key, of_this_update = jax.random.split(state.key)
+    rollout_key, disc_key, ppo_key = jax.random.split(of_device(of_this_update), 3)
     actors = Actors(
         policy=Policy(
             params=state.agent.policy.params, normalizer=state.obs_normalizer
@@ -62,7 +63,7 @@ def update_state(
         alpha=state.alpha,
     )
     taken = rollout(
-        of_device(rollout_key),
+        rollout_key,
         environment,
         actors,
         state.running,
@@ -74,14 +75,14 @@ def update_state(
     seen = {"obs": normalizer.moments(_flat(taken.transitions.obs))}
     if not environment.tracks_reference:
         disc, of_disc, features = _train_discriminator(
-            of_device(disc_key), state, taken.transitions.pairs, environment, config
+            disc_key, state, taken.transitions.pairs, environment, config
         )
         metrics |= of_disc
         seen |= {"features": features}
         state = dataclasses.replace(state, disc=disc)
     reward, of_reward = _rewards(state, taken.transitions, environment, config)
     batch = _ppo_batch(state, taken, reward, config.ppo)
-    agent, of_ppo = ppo.update(of_device(ppo_key), state.agent, batch, config.ppo, AXIS)
+    agent, of_ppo = ppo.update(ppo_key, state.agent, batch, config.ppo, AXIS)
     if config.train.start_from is not None:
         agent = _policy_waiting(state, agent)
     metrics |= of_reward | of_ppo
@@ -125,23 +126,19 @@ def _train_discriminator(
     expert_key, row_key, noise_key = jax.random.split(key, 3)
     expert = Pairs(*environment.expert_pairs(expert_key, count))
     flat = jax.tree.map(_flat, pairs)
-    rows = jax.random.randint(row_key, (count,), 0, flat.s.shape[0])
+    share, tuples = jax.random.uniform(row_key, (count,)), flat.s.shape[0]
+    rows = (share * tuples).astype(jnp.int32)
     policy = jax.tree.map(lambda x: x[rows], flat)
 
-    normal, noise_keys = state.feature_normalizer, jax.random.split(noise_key)
+    normal = state.feature_normalizer
     x_expert = discriminator.inputs(normal, expert, config.disc)
     x_policy = discriminator.inputs(normal, policy, config.disc)
-
-    def minibatches(key: Array, x: Array) -> Array:
-        x = discriminator.blurred(key, x, flat.s.shape[-1], config.disc)
-        return x.reshape(config.disc.minibatches, size, -1)
-
+    both = discriminator.blurred(
+        noise_key, jnp.stack([x_expert, x_policy]), flat.s.shape[-1], config.disc
+    )
+    expert_batches, policy_batches = both.reshape(2, config.disc.minibatches, size, -1)
     disc, metrics = discriminator.update(
-        state.disc,
-        minibatches(noise_keys[0], x_expert),
-        minibatches(noise_keys[1], x_policy),
-        config.disc,
-        AXIS,
+        state.disc, expert_batches, policy_batches, config.disc, AXIS
     )
     metrics |= discriminator.judged(disc.params, x_expert, x_policy)
     both = jnp.concatenate([policy.s_next, expert.s_next])

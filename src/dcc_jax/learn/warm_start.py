@@ -6,7 +6,7 @@ the feed-forward part by supervised regression: from a moment of the clips to th
 targets that lead along them. It falls within a second or two, but in style; the rest is
 left to PPO. `train.warm_start_steps = 0` leaves it out.
 
-Letters: N samples, O observation, A actions.
+Letters: S steps, N samples of a step, O observation, A actions.
 """
 
 from __future__ import annotations
@@ -17,39 +17,30 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from dcc_jax.learn import networks, normalizer, ppo
+from dcc_jax.learn import networks, ppo
 from dcc_jax.learn.exchange import mean_tree
-from dcc_jax.learn.normalizer import Normalizer
 from dcc_jax.learn.ppo import PpoConfig
-from dcc_jax.learn.rollout import Environment
 
 Array = jax.Array
 
-SAMPLES = 256  # of a step, over all devices; 1024 lead to the same error
+SAMPLES = 128  # of a step, over all devices; more lead to the same error
 LEARNING_RATE = 1e-3
 
 
 def warm_start(
-    key: Array,
-    agent: ppo.Agent,
-    obs_normalizer: Normalizer,
-    environment: Environment,
-    config: PpoConfig,
-    steps: int,
-    axis_name: str,
+    agent: ppo.Agent, obs: Array, action: Array, config: PpoConfig, axis_name: str
 ) -> ppo.Agent:
     """Regression of the policy's mean action on demonstrations.
 
     Args:
-        key: of this device; consumed.
         agent: with fresh networks.
-        obs_normalizer: with which the policy will begin.
-        environment: shows what to do.
+        obs: [S, N, O] normalised, of this device, of S gradient steps; the step size
+            falls to zero over them.
+        action: [S, N, A] rad.
         config: of the policy; its optimiser's memory is fresh again afterwards.
-        steps: gradient steps; the step size falls to zero over them.
         axis_name: mesh axis whose devices share the samples.
     """
-    local = max(SAMPLES // jax.lax.axis_size(axis_name), 1)
+    steps = obs.shape[0]
     falling = optax.linear_schedule(LEARNING_RATE, 0.0, steps)
     optimizer = networks.clipped_adam(falling, config.max_gradient_norm)
 
@@ -57,14 +48,11 @@ def warm_start(
         error = networks.apply_mlp(params, obs) - action
         return jnp.mean(jnp.sum(jnp.square(error), axis=-1))
 
-    def step(policy: networks.Network, key: Array):
-        keys = jax.random.split(key, local)
-        obs, action = jax.vmap(environment.expert_action)(keys)
-        obs = normalizer.normalize(obs_normalizer, obs)
-        gradient = mean_tree(jax.grad(loss)(policy.params, obs, action), axis_name)
+    def step(policy: networks.Network, shown: tuple[Array, Array]):
+        gradient = mean_tree(jax.grad(loss)(policy.params, *shown), axis_name)
         return networks.apply_gradients(policy, gradient, optimizer)
 
     begin = networks.init_network(agent.policy.params, optimizer)
-    policy, _ = jax.lax.scan(step, begin, jax.random.split(key, steps))
+    policy, _ = jax.lax.scan(step, begin, (obs, action))
     fresh = dataclasses.replace(agent.policy, params=policy.params)
     return dataclasses.replace(agent, policy=fresh)

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
 from dcc_jax.character import Character
@@ -261,6 +260,8 @@ def low_pass(clip: Clip, hz: float) -> Clip:
     """
     if not 0.0 < hz < 0.5 * clip.fps:
         raise ValueError(f"hz must be within 0 and {0.5 * clip.fps}, got {hz}")
+    from scipy.signal import butter, sosfiltfilt  # takes as long as jax to import
+
     sos = butter(2, hz, fs=clip.fps, output="sos")
     pad = min(len(clip.qpos) - 1, math.ceil(clip.fps))
     if clip.loop:

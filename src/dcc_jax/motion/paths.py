@@ -13,6 +13,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from dcc_jax import draws
 from dcc_jax.character import CONTROL_DT
 
 Array = jax.Array
@@ -162,12 +163,12 @@ def _advanced(motion: Motion) -> Motion:
 
 
 def _wanting(key: Array, gaits: Gaits, motion: Motion) -> Motion:
-    speed_key, turn_key, time_key = jax.random.split(key, 3)
+    count = len(gaits.speeds)
+    which, turn, left = draws.uniform(
+        key, (0.0, count), (-gaits.turn_rate, gaits.turn_rate), gaits.leg_time
+    )
     due = motion.left <= 0.0
-    speed = jax.random.choice(speed_key, jnp.array(gaits.speeds))
-    turn = jax.random.uniform(turn_key, minval=-gaits.turn_rate, maxval=gaits.turn_rate)
-    shortest, longest = gaits.leg_time
-    left = jax.random.uniform(time_key, minval=shortest, maxval=longest)
+    speed = jnp.array(gaits.speeds)[which.astype(jnp.int32)]
     return dataclasses.replace(
         motion,
         wanted_speed=jnp.where(due, speed, motion.wanted_speed),

@@ -119,15 +119,15 @@ class References:
             radius: move it by up to this far in x and in y, m.
             begin: take the first such moment of the clip instead of drawing one.
         """
-        clip_key, time_key, turn_key, shift_key = jax.random.split(key, 4)
-        clip = self._draw(clip_key, ())
+        draws = jax.random.uniform(key, (5,))
+        clip = self._drawn(draws[0])
         first = jnp.where(self.loop[clip], 0.0, self.control_dt)
-        share = 0.0 if begin else jax.random.uniform(time_key)
+        share = 0.0 if begin else draws[1]
         state = self.state_at(clip, first + share * (self.duration[clip] - first))
         if not heading and radius == 0.0:
             return state
-        turn = jax.random.uniform(turn_key, minval=-jnp.pi, maxval=jnp.pi) * heading
-        shift = jax.random.uniform(shift_key, (2,), minval=-radius, maxval=radius)
+        turn = jnp.pi * (2.0 * draws[2] - 1.0) * heading
+        shift = radius * (2.0 * draws[3:] - 1.0)
         linear = quat.rotate(_about_z(turn), state.qvel[ROOT_LINEAR])
         return dataclasses.replace(
             state,
@@ -143,12 +143,12 @@ class References:
 
         Three poses one control step apart; none reaches past the end of a clip.
         """
-        clip_key, time_key = jax.random.split(key)
-        clip = self._draw(clip_key, (count,))
+        draws = jax.random.uniform(key, (2, count))
+        clip = self._drawn(draws[0])
         span = self.duration[clip] - jnp.where(
             self.loop[clip], 0.0, 2.0 * self.control_dt
         )
-        start = jax.random.uniform(time_key, (count,)) * span
+        start = draws[1] * span
         times = start[:, None] + self.control_dt * jnp.arange(3)
         at = jax.vmap(jax.vmap(self.qpos_at, (None, 0)))
         return at(clip, times), jax.vmap(self.phase_at)(clip, times[:, 2])
@@ -159,8 +159,10 @@ class References:
         moves = jnp.where(self.loop[clip], mean, 0.0)
         return _turned(cycle * self.turn[clip], moves)
 
-    def _draw(self, key: Array, shape: tuple[int, ...]) -> Array:
-        return jax.random.categorical(key, jnp.log(self.weight), shape=shape)
+    def _drawn(self, share: Array) -> Array:
+        """The clip [...] of a uniform number [...] in [0, 1), by weight."""
+        ends = jnp.cumsum(self.weight)[:-1]
+        return jnp.sum(share[..., None] >= ends, axis=-1)
 
     def _place(
         self, clip: Array | int, time: Array | float

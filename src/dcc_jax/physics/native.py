@@ -10,6 +10,7 @@ to single precision, more slowly, and compiled for longer. DCC_JAX_NATIVE=0 asks
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import hashlib
 import importlib.util
@@ -19,6 +20,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -49,10 +51,24 @@ FLAGS = (
 )
 
 
+_one_at_a_time = threading.Lock()
+
+
+def begin() -> None:
+    """Compiles the kernel, if it has to be, while the caller goes on."""
+
+    def compiled() -> None:
+        with contextlib.suppress(OSError, subprocess.SubprocessError):
+            _compiled()  # whoever needs it complains
+
+    if _wanted():
+        threading.Thread(target=compiled).start()
+
+
 @cache
 def available() -> bool:
     """Whether the kernel serves this process: on a CPU, compiled and registered."""
-    if os.environ.get(SETTING) == "0" or jax.default_backend() != "cpu":
+    if not _wanted():
         return False
     try:
         library = ctypes.cdll.LoadLibrary(str(_compiled()))
@@ -200,8 +216,18 @@ def _packed(shape: Arrow, layout: Layout) -> np.ndarray:
     return np.concatenate([head, *dofs, count, *parts]).astype(np.int32)
 
 
+def _wanted() -> bool:
+    return os.environ.get(SETTING) != "0" and jax.default_backend() == "cpu"
+
+
 def _compiled() -> Path:
     """The shared library, in the cache of compiled programs."""
+    with _one_at_a_time:
+        return _made()
+
+
+@cache
+def _made() -> Path:
     command, source = [*_compiler(), *FLAGS], SOURCE.read_bytes()
     text = " ".join([*command, platform.machine(), _processor(), jax.__version__])
     name = hashlib.sha256(source + text.encode()).hexdigest()[:16]

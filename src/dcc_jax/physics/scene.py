@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 
 from dcc_jax.character import Character
+from dcc_jax.physics import native
 from dcc_jax.physics.native import Layout
 from dcc_jax.physics.quiet_mjx import mjx
 from dcc_jax.physics.sparsity import Arrow, arrow
@@ -133,6 +134,7 @@ def make_scene(
     spd[dof_adr : dof_adr + character.nv] = model.opt.timestep * character.kv
     model.dof_armature += spd
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    native.begin()
     mjx_model = mjx.put_model(model)
     template = mjx.make_data(mjx_model)
     contact_bodies = _contact_bodies(model, mjx_model, template)

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from dcc_jax import physics, quat
+from dcc_jax import draws, physics, quat
 from dcc_jax.character import CONTROL_DT, CONTROL_RATE
 from dcc_jax.env import features
 from dcc_jax.env.task import Forces, Task, place_character
@@ -140,16 +140,15 @@ class Ball(Task):
         self, key: Array, scene: physics.Scene, reference: RefState
     ) -> tuple[BallState, Array, Array]:
         """The pole nearly upright, moving along with the head."""
-        lean_key, push_key = jax.random.split(key)
+        tilt = (-self.tilt, self.tilt)
+        *lean, wait = draws.uniform(key, tilt, tilt, (0.0, self.interval))
         qpos, qvel = place_character(scene, reference)
-        lean = jax.random.uniform(lean_key, (2,), minval=-self.tilt, maxval=self.tilt)
         crown = _on_head(reference.qpos, CROWN)
         velocity = CONTROL_RATE * (crown - _on_head(reference.qpos_previous, CROWN))
         q_adr, v_adr = scene.address("pole")
-        pose = jnp.concatenate([crown, quat.exp(jnp.append(lean, 0.0))])
-        state = BallState(self.interval * jax.random.uniform(push_key))
+        pose = jnp.concatenate([crown, quat.exp(jnp.stack([*lean, jnp.zeros(())]))])
         return (
-            state,
+            BallState(wait),
             qpos.at[q_adr : q_adr + 7].set(pose),
             qvel.at[v_adr : v_adr + 3].set(velocity),
         )
@@ -166,9 +165,7 @@ class Ball(Task):
 
     def _pushed(self, key: Array, scene: physics.Scene, body: physics.State) -> Array:
         """Velocities [nv] after an impulse on the ball; the pivot stays as it moves."""
-        side_key, speed_key = jax.random.split(key)
-        side = jax.random.uniform(side_key, minval=-jnp.pi, maxval=jnp.pi)
-        speed = jax.random.uniform(speed_key, minval=self.push[0], maxval=self.push[1])
+        side, speed = draws.uniform(key, (-jnp.pi, jnp.pi), self.push)
         change_w = speed * jnp.stack([jnp.cos(side), jnp.sin(side), jnp.zeros(())])
         q_adr, v_adr = scene.address("pole")
         change = quat.rotate(quat.inv(body.qpos[q_adr + 3 : q_adr + 7]), change_w)

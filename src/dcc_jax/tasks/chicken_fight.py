@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from dcc_jax import physics, quat
+from dcc_jax import draws, physics, quat
 from dcc_jax.character import CONTROL_DT, add_contact
 from dcc_jax.env import features
 from dcc_jax.env.task import Forces, Task, place_character, resultant
@@ -143,13 +143,13 @@ class ChickenFight(Task):
         self, key: Array, scene: physics.Scene, reference: RefState
     ) -> tuple[ChickenFightState, Array, Array]:
         """The box waits out of reach; it comes after a random share of the interval."""
-        way_key, motion_key, attack_key = jax.random.split(key, 3)
-        way = jax.random.uniform(way_key, minval=-jnp.pi, maxval=jnp.pi)
+        draw_key, motion_key = jax.random.split(key)
+        way, wait = draws.uniform(draw_key, (-jnp.pi, jnp.pi), (0.0, self.interval))
         root = reference.qpos[:2]
         state = ChickenFightState(
             motion=paths.begin(motion_key, self.gaits, root, jnp.zeros(2), way),
             facing=jnp.zeros(()),
-            next_attack=self.interval * jax.random.uniform(attack_key),
+            next_attack=wait,
             coming=jnp.zeros((), bool),
             since_bump=jnp.full((), LONG),
             impulse=jnp.zeros(3),
@@ -187,13 +187,8 @@ class ChickenFight(Task):
         self, key: Array, scene: physics.Scene, body: physics.State
     ) -> physics.State:
         """The box on its way to the character, one face ahead."""
-        side_key, aim_key, speed_key = jax.random.split(key, 3)
-        side = jax.random.uniform(side_key, minval=-jnp.pi, maxval=jnp.pi)
-        aim = jax.random.uniform(
-            aim_key, minval=-self.off_centre, maxval=self.off_centre
-        )
-        slow, fast = self.speed
-        speed = jax.random.uniform(speed_key, minval=slow, maxval=fast)
+        off = (-self.off_centre, self.off_centre)
+        side, aim, speed = draws.uniform(key, (-jnp.pi, jnp.pi), off, self.speed)
         away = paths.direction(side)
         across = jnp.stack([-away[1], away[0]])
         root = scene.character_qpos(body.qpos)[:2]

@@ -7,7 +7,6 @@ and of ONE match, as in `env.environment`.
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import math
 from collections.abc import Callable
@@ -130,8 +129,8 @@ class Match:
             Fighter(prefix=RIVAL, opponent=ROOT),
         )
         self.sides = (
-            _at(first, scenes[0], self.fighters[0]),
-            _at(second, scenes[1], self.fighters[1]),
+            first.elsewhere(scenes[0], self.fighters[0]),
+            second.elsewhere(scenes[1], self.fighters[1]),
         )
 
     @property
@@ -230,13 +229,6 @@ def _shared(
     )
     mine = {name: getattr(first, name) for name in ("character", "qpos_adr", "dof_adr")}
     return dataclasses.replace(second, **mine), second
-
-
-def _at(environment: Environment, scene: physics.Scene, task: Fighter) -> Environment:
-    """The same environment in another scene."""
-    moved = copy.copy(environment)
-    moved.scene, moved.task = scene, task
-    return moved
 
 
 def _stood(side: Environment, state: EnvState, turn: float, spot: Array) -> EnvState:

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from dcc_jax import physics
+from dcc_jax import draws, physics
 from dcc_jax.character import CONTROL_DT, GRAVITY, add_contact
 from dcc_jax.env.task import Forces, Task, place_character
 from dcc_jax.motion.reference import RefState
@@ -108,12 +108,8 @@ class Push(Task):
     def _thrown(
         self, key: Array, scene: physics.Scene, body: physics.State
     ) -> physics.State:
-        side_key, height_key, speed_key = jax.random.split(key, 3)
-        side = jax.random.uniform(side_key, minval=-jnp.pi, maxval=jnp.pi)
-        low, high = AIM_HEIGHTS
-        height = jax.random.uniform(height_key, minval=low, maxval=high)
-        speed = jax.random.uniform(
-            speed_key, minval=self.speed[0], maxval=self.speed[1]
+        side, height, speed = draws.uniform(
+            key, (-jnp.pi, jnp.pi), AIM_HEIGHTS, self.speed
         )
         away = jnp.stack([jnp.cos(side), jnp.sin(side), jnp.zeros(())])
         root, drift = scene.character_qpos(body.qpos)[:2], _drift(scene, body)

@@ -21,7 +21,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from dcc_jax import physics
+from dcc_jax import draws, physics
 from dcc_jax.character import CONTROL_DT
 from dcc_jax.env.task import Forces, Task, place_character
 from dcc_jax.motion import paths, planner
@@ -115,13 +115,22 @@ class SustainedPush(Task):
         body: physics.State,
     ) -> tuple[SustainedPushState, physics.State]:
         """The path goes on; pushes and pauses take turns."""
-        rest_key, push_key, motion_key = jax.random.split(key, 3)
+        change_key, motion_key = jax.random.split(key)
+        *push, rest = draws.uniform(
+            change_key,
+            (-jnp.pi, jnp.pi),
+            (-self.slope, self.slope),
+            self.strength,
+            (0.0, len(self.bodies)),
+            self.duration,
+            self.pause,
+        )
         over = state.left <= 0.0
         pushing = jnp.any(state.force_w != 0.0)
         changed = jax.tree.map(
             lambda a, b: jnp.where(pushing, a, b),
-            self._resting(rest_key, state),
-            self._pushing(push_key, state),
+            dataclasses.replace(state, force_w=jnp.zeros(3), left=rest),
+            self._pushing(push, state),
         )
         state = jax.tree.map(lambda a, b: jnp.where(over, a, b), changed, state)
         motion = paths.go_on(motion_key, self.gaits, state.motion)
@@ -134,27 +143,19 @@ class SustainedPush(Task):
             since=state.since + CONTROL_DT,
         ), body
 
-    def _resting(self, key: Array, state: SustainedPushState) -> SustainedPushState:
-        shortest, longest = self.pause
-        left = jax.random.uniform(key, minval=shortest, maxval=longest)
-        return dataclasses.replace(state, force_w=jnp.zeros(3), left=left)
-
-    def _pushing(self, key: Array, state: SustainedPushState) -> SustainedPushState:
-        keys = jax.random.split(key, 5)
-        way = jax.random.uniform(keys[0], minval=-jnp.pi, maxval=jnp.pi)
-        slope = jax.random.uniform(keys[1], minval=-self.slope, maxval=self.slope)
-        weak, strong = self.strength
-        size = jax.random.uniform(keys[2], minval=weak, maxval=strong)
+    def _pushing(
+        self, drawn: list[Array], state: SustainedPushState
+    ) -> SustainedPushState:
+        way, slope, size, target, left = drawn
         level = jnp.cos(slope)
         direction = jnp.stack(
             [level * jnp.cos(way), level * jnp.sin(way), jnp.sin(slope)]
         )
-        shortest, longest = self.duration
         return dataclasses.replace(
             state,
             force_w=size * direction,
-            target=jax.random.randint(keys[3], (), 0, len(self.bodies)),
-            left=jax.random.uniform(keys[4], minval=shortest, maxval=longest),
+            target=target.astype(jnp.int32),
+            left=left,
             since=jnp.zeros(()),
         )
 

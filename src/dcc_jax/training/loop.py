@@ -167,49 +167,47 @@ def _loop(run: Run, progress: logs.Progress, stop: StopSignal) -> TrainResult:
 def _prepared(
     run: Run, say: Callable[[str], None]
 ) -> tuple[TrainState, learner.Update]:
-    """The first state and the compiled update, which compile side by side.
+    """The first state and the compiled update.
 
-    One after the other they are traced: jax shares what it has traced, and where two
-    threads race for that, the program is another one at every start, which no compile
-    cache holds.
+    The state is made beside the update. Only one thread traces: jax shares what it has
+    traced, and where two race for that, the program is another one at every start,
+    which no compile cache holds.
     """
     say(f"compiling for {run.mesh.size} {jax.default_backend()} device(s) ...")
     began = time.perf_counter()
     init = learner.make_init(run.environment, run.config, run.mesh, start=run.start)
-    template = jax.eval_shape(init, jax.random.key(run.config.seed), None)
-    lowered = _lowered(run, template)
-    with ThreadPoolExecutor(1) as beside:
-        update = beside.submit(lowered.compile)
-        state = _first_state(run, init, template, say)
-        compiled = update.result()
-    say(f"compiled in {time.perf_counter() - began:.1f} s")
-    return state, compiled
-
-
-def _first_state(
-    run: Run,
-    init: learner.Init,
-    template: TrainState,
-    say: Callable[[str], None],
-) -> TrainState:
-    """From the last checkpoint, or drawn from the seed where there is none yet."""
     key = jax.random.key(run.config.seed)
-    if run.resume:
-        found = checkpoint.restore_latest(run.run_dir, template, say)
-        if found is not None:
-            update, arrays = found
-            say(f"resuming {run.run_dir} after update {update}")
-            kept = (run.run_dir / "metrics.jsonl").exists()
-            rows = logs.read(run.run_dir)[:update] if kept else []
-            had = rows[-1].get("devices", run.mesh.size) if rows else run.mesh.size
-            if had != run.mesh.size:
-                say(
-                    f"it had {had:.0f} devices and goes on with {run.mesh.size}: from "
-                    "here on it is another run"
-                )
-            shardings = learner.state_shardings(run.mesh, arrays)
-            return processes.to_devices(arrays, shardings)
-    return init(key, None)
+    template = jax.eval_shape(init, key, None)
+    if run.resume and checkpoint.available(run.run_dir):
+        begin = partial(_restored, run, template, say)
+    else:
+        lowered = init.lower(key, None)  # pyright: ignore[reportFunctionMemberAccess]
+
+        def begin() -> TrainState:
+            return lowered.compile()(key, None)
+
+    with ThreadPoolExecutor(1) as beside:
+        state = beside.submit(begin)
+        compiled = _lowered(run, template).compile()
+    say(f"compiled in {time.perf_counter() - began:.1f} s")
+    return state.result(), compiled
+
+
+def _restored(run: Run, template: TrainState, say: Callable[[str], None]) -> TrainState:
+    """The state of the last checkpoint that can be read."""
+    found = checkpoint.restore_latest(run.run_dir, template, say)
+    assert found is not None
+    update, arrays = found
+    say(f"resuming {run.run_dir} after update {update}")
+    kept = (run.run_dir / "metrics.jsonl").exists()
+    rows = logs.read(run.run_dir)[:update] if kept else []
+    had = rows[-1].get("devices", run.mesh.size) if rows else run.mesh.size
+    if had != run.mesh.size:
+        say(
+            f"it had {had:.0f} devices and goes on with {run.mesh.size}: from here on "
+            "it is another run"
+        )
+    return processes.to_devices(arrays, learner.state_shardings(run.mesh, arrays))
 
 
 def _lowered(run: Run, template: TrainState) -> jax.stages.Lowered:
