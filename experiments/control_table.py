@@ -75,6 +75,17 @@ SKILLS = {
             *U,
         ),
     ),
+    "backflip": Skill(
+        6.0,
+        (
+            FELL,
+            Line("task/flips/final", "backflips landed and stood (%)", 100.0),
+            Line("contact/foot_low", "lowest sole during contact (mm)", 1e3),
+            Line("contact/pelvis_low", "lowest pelvis during contact (mm)", 1e3),
+            *IN_CONTACT,
+            *U,
+        ),
+    ),
     "hand-in-hand": Skill(
         10.0,
         (
