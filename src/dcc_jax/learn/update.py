@@ -133,12 +133,12 @@ def _train_discriminator(
     normal = state.feature_normalizer
     x_expert = discriminator.inputs(normal, expert, config.disc)
     x_policy = discriminator.inputs(normal, policy, config.disc)
-    both = discriminator.blurred(
+    blurred = discriminator.blurred(
         noise_key, jnp.stack([x_expert, x_policy]), flat.s.shape[-1], config.disc
     )
-    expert_batches, policy_batches = both.reshape(2, config.disc.minibatches, size, -1)
+    of_expert, of_policy = blurred.reshape(2, config.disc.minibatches, size, -1)
     disc, metrics = discriminator.update(
-        state.disc, expert_batches, policy_batches, config.disc, AXIS
+        state.disc, of_expert, of_policy, config.disc, AXIS
     )
     metrics |= discriminator.judged(disc.params, x_expert, x_policy)
     both = jnp.concatenate([policy.s_next, expert.s_next])

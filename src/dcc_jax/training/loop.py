@@ -169,9 +169,9 @@ def _prepared(
 ) -> tuple[TrainState, learner.Update]:
     """The first state and the compiled update.
 
-    The state is made beside the update. Only one thread traces: jax shares what it has
-    traced, and where two race for that, the program is another one at every start,
-    which no compile cache holds.
+    A new state is compiled and made beside the update. Only this thread traces: jax
+    shares what it has traced, and where two race for that, the program is another one
+    at every start, which no compile cache holds.
     """
     say(f"compiling for {run.mesh.size} {jax.default_backend()} device(s) ...")
     began = time.perf_counter()
@@ -179,18 +179,16 @@ def _prepared(
     key = jax.random.key(run.config.seed)
     template = jax.eval_shape(init, key, None)
     if run.resume and checkpoint.available(run.run_dir):
-        begin = partial(_restored, run, template, say)
+        state = _restored(run, template, say)
+        compiled = _lowered(run, template).compile()
     else:
         lowered = init.lower(key, None)  # pyright: ignore[reportFunctionMemberAccess]
-
-        def begin() -> TrainState:
-            return lowered.compile()(key, None)
-
-    with ThreadPoolExecutor(1) as beside:
-        state = beside.submit(begin)
-        compiled = _lowered(run, template).compile()
+        with ThreadPoolExecutor(1) as beside:
+            made = beside.submit(lambda: lowered.compile()(key, None))
+            compiled = _lowered(run, template).compile()
+        state = made.result()
     say(f"compiled in {time.perf_counter() - began:.1f} s")
-    return state.result(), compiled
+    return state, compiled
 
 
 def _restored(run: Run, template: TrainState, say: Callable[[str], None]) -> TrainState:
