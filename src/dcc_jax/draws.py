@@ -1,7 +1,7 @@
 """Random numbers that belong together, drawn at once.
 
-Every draw is a program of its own to XLA, and costs more time to compile than most of
-what is done with its numbers. So whoever needs several numbers draws them in one go.
+Every draw brings loops of its own, which LLVM compiles for about a second
+(docs/performance.md). So whoever needs several numbers draws them in one go.
 """
 
 from __future__ import annotations
