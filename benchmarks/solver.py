@@ -28,7 +28,7 @@ import numpy as np
 from dcc_jax import physics, tasks
 from dcc_jax.config import make_config
 from dcc_jax.env.environment import Environment
-from dcc_jax.physics import contact_solver, native
+from dcc_jax.physics import contact_solver, native, newton_kernel
 from dcc_jax.physics.quiet_mjx import mjx
 
 Array = jax.Array
@@ -50,9 +50,7 @@ def problems(environment: Environment, count: int) -> tuple[mjx.Data, Array, Arr
             qpos=body.qpos.at[scene.qpos_adr + 2].add(-sunk),
             qvel=body.qvel + 0.5 * jax.random.normal(keys[1], body.qvel.shape),
         )
-        data = physics.kinematics(scene, body).data
-        for stage in (mjx.com_vel, mjx.passive, mjx.rne):
-            data = stage(scene.mjx_model, data)
+        data = mjx.passive(scene.mjx_model, physics.kinematics(scene, body).data)
         pushed = 20.0 * jax.random.normal(keys[2], body.qvel.shape)
         smooth = pushed + data.qfrc_passive - data.qfrc_bias
         return data, smooth, jnp.zeros_like(body.qvel)
@@ -66,13 +64,13 @@ def solvers(environment: Environment, iterations: int) -> dict[str, Callable]:
     model = scene.mjx_model
 
     def kernel(data: mjx.Data, smooth: Array, start: Array) -> tuple[Array, Array]:
-        given = native.problem(model, data, smooth, start)
-        return native.newton(scene.arrow, scene.layout, given, iterations)
+        given = newton_kernel.problem(model, data, smooth, start)
+        return newton_kernel.newton(scene.arrow, scene.layout, given, iterations)
 
     def in_jax(data: mjx.Data, smooth: Array, start: Array) -> tuple[Array, Array]:
-        data = mjx.make_constraint(model, mjx.crb(model, data))
-        mass, made, equalities = mjx.full_m(model, data), data._impl, data._impl.ne
-        rows = contact_solver.Rows(made.efc_J, made.efc_D, made.efc_aref, equalities)
+        mass = physics.mass_matrix(scene, physics.Kinematics(data))
+        made = mjx.make_constraint(model, data)._impl
+        rows = contact_solver.Rows(made.efc_J, made.efc_D, made.efc_aref, made.ne)
         return contact_solver.newton(scene.arrow, mass, smooth, rows, start, iterations)
 
     return {"kernel": jax.jit(jax.vmap(kernel)), "JAX": jax.jit(jax.vmap(in_jax))}

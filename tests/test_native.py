@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dcc_jax import physics
-from dcc_jax.physics import contact_solver, native
+from dcc_jax.physics import contact_solver, native, newton_kernel
 from dcc_jax.physics import scene as scenes
 from dcc_jax.physics.quiet_mjx import mjx
 from dcc_jax.physics.sparsity import arrow
@@ -33,9 +33,9 @@ MODEL = mujoco.MjModel.from_xml_string(
 MODEL.dof_armature[:] = np.linspace(0.01, 0.02, MODEL.nv)
 DEVICE = mjx.put_model(MODEL)
 TEMPLATE = mjx.make_data(DEVICE)
-BODIES = scenes._contact_bodies(MODEL, DEVICE, TEMPLATE)
-SHAPE = arrow(MODEL, scenes._row_pattern(MODEL, BODIES))
-LAYOUT = native.Layout.of(MODEL, BODIES, TEMPLATE._impl.ne)
+CONTACTS = scenes._contacts(DEVICE, TEMPLATE)
+SHAPE = arrow(MODEL, scenes._row_pattern(MODEL, MODEL.geom_bodyid[CONTACTS.geom]))
+LAYOUT = newton_kernel.Layout.of(MODEL, CONTACTS, TEMPLATE._impl.ne)
 needs_kernel = pytest.mark.skipif(
     not native.available(), reason="no C++ compiler: the solver runs in JAX"
 )
@@ -63,7 +63,7 @@ def both(states):
         data = TEMPLATE.replace(qpos=qpos, qvel=qvel)
         for stage in (mjx.kinematics, mjx.com_pos, mjx.crb, mjx.collision):
             data = stage(DEVICE, data)
-        given = native.problem(DEVICE, data, smooth, start)
+        given = newton_kernel.problem(DEVICE, data, smooth, start)
         data = mjx.make_constraint(DEVICE, data)
         rows = contact_solver.Rows(
             data._impl.efc_J, data._impl.efc_D, data._impl.efc_aref, LAYOUT.num_equality
@@ -76,7 +76,7 @@ def both(states):
 
 
 def kernel(given):
-    return native.newton(SHAPE, LAYOUT, given, ITERATIONS)
+    return newton_kernel.newton(SHAPE, LAYOUT, given, ITERATIONS)
 
 
 @needs_kernel
@@ -163,7 +163,7 @@ def test_without_a_compiler_one_line_says_that_the_solver_runs_in_jax(
     forgetful.setattr(native, "_compiled", failure)
     assert not native.available()
     said = capsys.readouterr().err
-    assert said.count("\n") == 1 and "contact solver in JAX" in said and reason in said
+    assert said.count("\n") == 1 and "physics in JAX" in said and reason in said
 
 
 def test_physics_goes_on_in_jax_without_the_kernel(monkeypatch, scene):
@@ -186,4 +186,4 @@ def test_the_kernel_can_be_switched_off(forgetful):
 
 
 def test_source_of_the_kernel_travels_with_the_package():
-    assert native.SOURCE.is_file()
+    assert (native.SOURCES / "newton.cc").is_file()

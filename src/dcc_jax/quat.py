@@ -69,7 +69,22 @@ def log(q: Array) -> Array:
     norm = jnp.sqrt(jnp.where(small, 1.0, norm2))
     safe_real = jnp.where(small, jnp.maximum(real, 0.5), 1.0)
     near = 2.0 / safe_real - 2.0 / 3.0 * norm2 / safe_real**3
-    return jnp.where(small, near, 2.0 * jnp.arctan2(norm, real) / norm) * imag
+    return jnp.where(small, near, _angle(norm, real) / norm) * imag
+
+
+def _angle(sine: Array, cosine: Array) -> Array:
+    """2 atan2(sine, cosine) of what is not negative, rad.
+
+    XLA has no vector code for arctan2 on a CPU. Here the angle is halved twice, by
+    tan(a/2) = sin a / (cos a + 1), for which the series of Cephes' `atanf` suffices.
+    """
+    if sine.dtype == jnp.float64:
+        return 2.0 * jnp.arctan2(sine, cosine)
+    x = sine / (cosine + jnp.sqrt(sine * sine + cosine * cosine))
+    x = x / (1.0 + jnp.sqrt(1.0 + x * x))
+    z = x * x
+    series = ((8.05374449538e-2 * z - 1.38776856032e-1) * z + 1.99777106478e-1) * z
+    return 8.0 * (x + x * z * (series - 3.33329491539e-1))
 
 
 def rotate(q: Array, v: Array) -> Array:

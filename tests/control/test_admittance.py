@@ -167,7 +167,9 @@ def test_inverse_right_jacobian_is_how_the_logarithm_changes():
             return quat.log(quat.mul(q, quat.exp(t * jnp.asarray(w))))
 
         _, expected = jax.jvp(turned, (0.0,), (1.0,))
-        found = ranges.inverse_right_jacobian(jnp.asarray(r), jnp.asarray(w))
+        found = ranges.inverse_right_jacobian(
+            jnp.asarray(r), jnp.asarray(w), ranges.second_coefficient(jnp.asarray(r))
+        )
         np.testing.assert_allclose(found, expected, atol=1e-6)
 
 

@@ -40,7 +40,7 @@ class JointRanges:
         r = quat.log(pose)
         lower = jnp.minimum(jnp.asarray(self.lower, r.dtype), r)
         upper = jnp.maximum(jnp.asarray(self.upper, r.dtype), r)
-        return Room(pose, r, lower, upper)
+        return Room(pose, r, lower, upper, second_coefficient(r))
 
 
 @flax.struct.dataclass
@@ -51,6 +51,7 @@ class Room:
     r: Array  # [J, 3] rad, log(q_m)
     lower: Array  # [J, 3] rad
     upper: Array  # [J, 3] rad
+    second: Array  # [J, 1] coefficient of Jr^-1(r), see `second_coefficient`
 
     def used(self, r: Array) -> Array:
         """Share of its room [J] that a joint at the rotation vector r [J, 3] uses."""
@@ -92,7 +93,7 @@ def bounded(coords: quat.Coordinates, room: Room, rest: Array) -> Array:
 def used(coords: quat.Coordinates, room: Room, tangent: Array) -> Array:
     """Share of its room [J] that each joint of a displacement's tangent [nv] uses."""
     joints = coords.split_v(tangent)[1][-len(room.r) :]
-    return room.used(room.r + inverse_right_jacobian(room.r, joints))
+    return room.used(room.r + inverse_right_jacobian(room.r, joints, room.second))
 
 
 def clip(coords: quat.Coordinates, room: Room, u: Array) -> Array:
@@ -113,18 +114,21 @@ def softened(coords: quat.Coordinates, room: Room, u: Array) -> Array:
     return jnp.any(room.used(room.turned(joints)) > LINEAR_SHARE)
 
 
-def inverse_right_jacobian(r: Array, w: Array) -> Array:
+def inverse_right_jacobian(r: Array, w: Array, second: Array) -> Array:
     """Jr^-1(r) w [..., 3]: how fast log(q) changes from r when q turns with q' = q w.
 
-    I + [r]x / 2 + (1 / a^2 - cot(a / 2) / (2 a)) [r]x^2, a = |r| below 2 pi.
+    I + [r]x / 2 + second [r]x^2, with its `second_coefficient` [..., 1].
     """
+    once = jnp.cross(r, w)
+    return w + 0.5 * once + second * jnp.cross(r, once)
+
+
+def second_coefficient(r: Array) -> Array:
+    """1 / a^2 - cot(a / 2) / (2 a) [..., 1], a = |r| below 2 pi."""
     a2 = _square(r)
     small = a2 < 1e-4
     a = jnp.sqrt(jnp.where(small, 1.0, a2))
-    large = 1.0 / a**2 - 0.5 / (a * jnp.tan(0.5 * a))
-    factor = jnp.where(small, 1.0 / 12.0, large)
-    once = jnp.cross(r, w)
-    return w + 0.5 * once + factor * jnp.cross(r, once)
+    return jnp.where(small, 1.0 / 12.0, 1.0 / a**2 - 0.5 / (a * jnp.tan(0.5 * a)))
 
 
 def _shortened(used: Array) -> Array:

@@ -16,7 +16,8 @@ import numpy as np
 
 from dcc_jax.character import Character
 from dcc_jax.physics import native
-from dcc_jax.physics.native import Layout
+from dcc_jax.physics.kinematics_kernel import Tree
+from dcc_jax.physics.newton_kernel import Layout
 from dcc_jax.physics.quiet_mjx import mjx
 from dcc_jax.physics.sparsity import Arrow, arrow
 from dcc_jax.quat import Coordinates
@@ -48,7 +49,9 @@ class Scene:
     mjx_model: mjx.Model  # on the device; constants of the compiled program
     template: mjx.Data  # constant: every step starts from it, only `State` is carried
     contact_bodies: np.ndarray  # [C, 2] body ids; the force acts on the second
-    layout: Layout  # of degrees of freedom and rows, for the kernel
+    moves: np.ndarray  # [nbody, nv] whether a degree of freedom moves a body
+    tree: Tree  # of bodies, for the kernel of kinematics
+    layout: Layout  # of degrees of freedom and rows, for the kernel of the solver
     arrow: Arrow  # where the matrices of the contact solver can be non-zero
     mass_arrow: Arrow  # where the mass matrix alone can
 
@@ -137,7 +140,8 @@ def make_scene(
     native.begin()
     mjx_model = mjx.put_model(model)
     template = mjx.make_data(mjx_model)
-    contact_bodies = _contact_bodies(model, mjx_model, template)
+    contacts = _contacts(mjx_model, template)
+    contact_bodies = model.geom_bodyid[contacts.geom]
     return Scene(
         model=model,
         character=character,
@@ -149,7 +153,9 @@ def make_scene(
         mjx_model=mjx_model,
         template=template,
         contact_bodies=contact_bodies,
-        layout=Layout.of(model, contact_bodies, template._impl.ne),
+        moves=np.array([_chain(model, body) for body in range(model.nbody)]),
+        tree=Tree.of(model, contacts),
+        layout=Layout.of(model, contacts, template._impl.ne),
         arrow=arrow(model, _row_pattern(model, contact_bodies)),
         mass_arrow=arrow(model, np.zeros((0, model.nv), bool)),
     )
@@ -163,15 +169,10 @@ def _address(model: mujoco.MjModel, joint: str) -> tuple[int, int]:
     return int(found.qposadr[0]), int(found.dofadr[0])
 
 
-def _contact_bodies(
-    model: mujoco.MjModel, mjx_model: mjx.Model, template: mjx.Data
-) -> np.ndarray:
-    """[C, 2] bodies of MJX's contact slots.
-
-    Their geoms are constants of the traced program; the rest of it is never computed.
-    """
-    geoms = jax.jit(lambda: mjx.collision(mjx_model, template)._impl.contact.geom)()
-    return model.geom_bodyid[np.asarray(geoms)]
+def _contacts(mjx_model: mjx.Model, template: mjx.Data) -> mjx.Contact:
+    """MJX's contact slots, as numpy; all but where they are is static."""
+    found = jax.jit(lambda: mjx.collision(mjx_model, template)._impl.contact)()
+    return jax.tree.map(np.asarray, found)
 
 
 def _row_pattern(model: mujoco.MjModel, contact_bodies: np.ndarray) -> np.ndarray:

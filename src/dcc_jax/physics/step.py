@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dcc_jax import quat
-from dcc_jax.physics import native
+from dcc_jax.physics import kinematics_kernel, native, newton_kernel
 from dcc_jax.physics.contact_solver import Rows, newton, solve_mass
 from dcc_jax.physics.quiet_mjx import mjx
 from dcc_jax.physics.scene import Scene
@@ -51,7 +51,11 @@ class World:
 
 @flax.struct.dataclass
 class Kinematics:
-    """Everything that depends on positions alone."""
+    """What follows from positions and velocities alone.
+
+    Of `data`, without the kernel, all that MJX's stages have; with it, those fields
+    that `kinematics_kernel.FIELDS` names, and the contacts.
+    """
 
     data: mjx.Data
 
@@ -93,7 +97,7 @@ def default_world(scene: Scene) -> World:
 
 
 def kinematics(scene: Scene, state: State, world: World | None = None) -> Kinematics:
-    """Poses, motion axes, composite inertias, mass matrix and contacts of a state."""
+    """Poses, axes, composite inertias, bias forces and contacts of a state."""
     model = scene.mjx_model
     data = scene.template.replace(qpos=state.qpos, qvel=state.qvel)
     if world is not None:
@@ -102,11 +106,22 @@ def kinematics(scene: Scene, state: State, world: World | None = None) -> Kinema
             mocap_quat=world.mocap_quat,
             eq_active=world.equality_active,
         )
-    data = mjx.kinematics(model, data)
-    data = mjx.com_pos(model, data)
-    data = mjx.crb(model, data)
-    data = mjx.collision(model, data)
+    if _native(scene, state):
+        data = kinematics_kernel.kinematics(scene.tree, data)
+    else:
+        stages = mjx.kinematics, mjx.com_pos, mjx.crb, mjx.com_vel, mjx.rne
+        for stage in stages:
+            data = stage(model, data)
+    if not (_native(scene, state) and scene.tree.collides):
+        data = mjx.collision(model, data)
     return Kinematics(data=data)
+
+
+def _native(scene: Scene, state: State) -> bool:
+    """Whether the kernels do it: in single precision, and where there is no fluid."""
+    single = state.qpos.dtype == jnp.float32
+    fluid = scene.mjx_model.opt._impl.has_fluid_params
+    return single and not fluid and native.available()
 
 
 def solve(scene: Scene, kin: Kinematics, state: State, qfrc: Array) -> Solution:
@@ -122,13 +137,11 @@ def solve(scene: Scene, kin: Kinematics, state: State, qfrc: Array) -> Solution:
         qfrc: applied generalized forces [nv], N and N m.
     """
     model, data = scene.mjx_model, kin.data
-    data = mjx.com_vel(model, data)
     data = mjx.passive(model, data)
-    data = mjx.rne(model, data)
     smooth = qfrc + data.qfrc_passive - data.qfrc_bias
-    if native.available() and smooth.dtype == jnp.float32:
-        given = native.problem(model, data, smooth, state.qacc)
-        qacc, force = native.newton(
+    if _native(scene, state):
+        given = newton_kernel.problem(model, data, smooth, state.qacc)
+        qacc, force = newton_kernel.newton(
             scene.arrow, scene.layout, given, scene.newton_iterations
         )
     else:
@@ -139,7 +152,7 @@ def solve(scene: Scene, kin: Kinematics, state: State, qfrc: Array) -> Solution:
             aref=data._impl.efc_aref,
             num_equality=data._impl.ne,
         )
-        mass = mjx.full_m(model, data)
+        mass = mass_matrix(scene, kin)
         qacc, force = newton(
             scene.arrow, mass, smooth, rows, state.qacc, scene.newton_iterations
         )
@@ -175,8 +188,32 @@ def integrate(scene: Scene, state: State, solution: Solution) -> State:
 
 def point_jacobian(scene: Scene, kin: Kinematics, point_w: Array, body: Array) -> Array:
     """J [3, nv] of a point [3] (m, world) fixed to a body (id): v_w = J qvel."""
-    jac, _ = mjx.jac(scene.mjx_model, kin.data, point_w, body)
-    return jac.T
+    data = kin.data
+    center_w = data.subtree_com[jnp.asarray(scene.mjx_model.body_rootid)[body]]
+    speed = data.cdof[:, 3:] + jnp.cross(data.cdof[:, :3], point_w - center_w)
+    return (speed * jnp.asarray(scene.moves)[body][:, None]).T
+
+
+def mass_matrix(scene: Scene, kin: Kinematics) -> Array:
+    """M [nv, nv], kg, kg m and kg m^2, with h*kv and armature on its diagonal.
+
+    M_ij is the momentum of i's composite body along i, times the motion of its ancestor
+    j: composite rigid bodies.
+    """
+    data, body = kin.data, scene.model.dof_bodyid
+    momentum = _momentum(data._impl.crb[body], data.cdof)
+    lower = jnp.tril((momentum @ data.cdof.T) * scene.moves[body])
+    armature = jnp.asarray(scene.model.dof_armature, lower.dtype)
+    return lower + jnp.tril(lower, -1).T + jnp.diag(armature)
+
+
+def _momentum(inertia: Array, motion: Array) -> Array:
+    """[nv, 6] of bodies with spatial inertias [nv, 10] that move along [nv, 6]."""
+    matrix = inertia[:, np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])]
+    offset, mass = inertia[:, 6:9], inertia[:, 9:]
+    turning, moving = motion[:, :3], motion[:, 3:]
+    spin = jnp.sum(matrix * turning[:, None], axis=-1) + jnp.cross(offset, moving)
+    return jnp.concatenate([spin, mass * moving - jnp.cross(offset, turning)], axis=-1)
 
 
 def mass_solve(scene: Scene, kin: Kinematics, qfrc: Array) -> Array:
@@ -185,7 +222,7 @@ def mass_solve(scene: Scene, kin: Kinematics, qfrc: Array) -> Array:
     With qfrc = J^T f this is FD(q, qd, f) - FD(q, qd, 0) of Alg. 1, because forward
     dynamics is linear in the external force.
     """
-    mass = mjx.full_m(scene.mjx_model, kin.data)
+    mass = mass_matrix(scene, kin)
     solved = solve_mass(
         scene.mass_arrow, mass, scene.spd_diagonal, jnp.atleast_2d(qfrc)
     )

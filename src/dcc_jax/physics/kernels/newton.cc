@@ -4,47 +4,32 @@
 // M and the rows of the contacts are made here, in the parts in which the solver wants
 // them: written out they are 4,500 numbers an environment, of which most are zero. The
 // algorithm, its stopping rule and its order of limbs and core are those of
-// contact_solver.py and arrowhead.py, which are the reference. Here a number is a vector,
-// a lane an environment. What a block of them needs stays in the CPU's cache through all
-// iterations, and rows that are inactive in all of them are passed over.
+// contact_solver.py and arrowhead.py, which are the reference. What a
+// block of environments needs stays in the CPU's cache through all iterations. Contacts
+// that are apart in all of them are left out, rows that are inactive passed over.
 
 #include <algorithm>
-#include <array>
-#include <cstdint>
+#include <cstring>
 #include <vector>
 
+#include "lanes.h"
+#include "spatial.h"
 #include "xla/ffi/api/ffi.h"
 
 namespace ffi = xla::ffi;
 
 namespace {
 
-// As many as a vector register holds: wider vectors would be taken apart in memory.
-#if defined(__AVX512F__)
-constexpr int kLanes = 16;
-#else
-constexpr int kLanes = 8;
-#endif
 constexpr int kLineSearchIterations = 4;
 constexpr float kFullStep = 1e-3f;
-
-typedef float V __attribute__((vector_size(4 * kLanes)));
-typedef int32_t I __attribute__((vector_size(4 * kLanes)));
-
-inline V all(float x) { return x - V{}; }
-inline V choose(I where, V yes, V no) { return where ? yes : no; }
-
-inline bool any(I where) {
-  int32_t found = 0;
-  for (int l = 0; l < kLanes; ++l) found |= where[l];
-  return found != 0;
-}
+constexpr float kTiny = 1e-15f;
 
 // A limb, or the core: its own unknowns, then those of the core that it is coupled with.
 struct Part {
   int own;                     // how many of `dofs` are its own
   std::vector<int> dofs;       // of the scene
   std::vector<int> rows;       // constraint rows that touch it
+  std::vector<int> live;       // places among them of those that may act
   std::vector<int> in_core;    // where the coupled ones are among the core's
   std::vector<V> mass, front;  // lower triangles [i * size + j]
   std::vector<V> J;            // [row * size + i]
@@ -61,12 +46,17 @@ struct Given {
   const float* smooth;    // [nv]
   const float* start;     // [nv]
   const float* J;         // [E, nv] rows of equalities and limits
-  const float* D;         // [E + C] of those rows, then of the contacts
-  const float* aref;      // [E + C] likewise; of a contact without its damping
-  const float* frame;     // [C, 9] normal and two tangents; zero where it is apart
+  const float* D;         // [E] of those rows
+  const float* aref;      // [E] likewise
+  const float* dist;      // [C] of contacts, negative where they touch
+  const float* frame;     // [C, 9] normal and two tangents
   const float* point;     // [C, 3]
-  const float* friction;  // [C, 2]
-  const float* damping;   // [C]
+};
+
+// What is constant of a contact (MuJoCo, "solver parameters").
+struct Constants {
+  float margin, friction[2], weight, stiffness, damping;
+  float low, high, width, middle, power;  // of the impedance
 };
 
 // One block of environments. `parts` ends with the core.
@@ -75,12 +65,15 @@ struct Block {
   std::vector<Part> parts;
   std::vector<int> parent, body, root;  // [nv] of a degree of freedom
   std::vector<float> armature;          // [nv]
+  std::vector<Constants> constants;     // [C]
+  std::vector<int8_t> touching;         // [C] in any environment of the block
+  std::vector<int> rows;                // that may act in any of them
   std::vector<int8_t> sign;             // [C * nv] how a dof moves a contact apart
   std::vector<V> motion, momentum;      // [nv * 6]
-  std::vector<V> D, aref, residual, slope, weight;
+  std::vector<V> D, aref, depth, residual, slope, weight;
   std::vector<V> velocity, smooth, x, mass_x, search, mass_search, y;
 
-  Block(ffi::Span<const int32_t> packed, ffi::Span<const float> armature,
+  Block(ffi::Span<const int32_t> packed, ffi::Span<const float> numbers,
         int iterations);
   void load(const Given& given, const int* env);
   void solve(const int* env, int count, float* qacc, float* force);
@@ -99,9 +92,9 @@ struct Block {
   V line_search(V gauss_1, V gauss_2) const;
 };
 
-Block::Block(ffi::Span<const int32_t> packed, ffi::Span<const float> diagonal,
+Block::Block(ffi::Span<const int32_t> packed, ffi::Span<const float> numbers,
              int iterations)
-    : iterations(iterations), armature(diagonal.begin(), diagonal.end()) {
+    : iterations(iterations) {
   const int32_t* at = packed.begin();
   for (int* number : {&nv, &num_rows, &num_equality, &num_given, &num_bodies})
     *number = *at++;
@@ -111,6 +104,12 @@ Block::Block(ffi::Span<const int32_t> packed, ffi::Span<const float> diagonal,
   }
   for (int c = 0; c < num_contacts(); ++c, at += 2)
     for (int i = 0; i < nv; ++i) sign.push_back(moves(i, at[1]) - moves(i, at[0]));
+  armature.assign(numbers.begin(), numbers.begin() + nv);
+  constants.resize(num_contacts());
+  touching.resize(num_contacts());
+  depth.resize(num_contacts());
+  std::memcpy(constants.data(), numbers.begin() + nv,
+              num_contacts() * sizeof(Constants));
   const int count = *at++;
   for (int p = 0; p < count; ++p) {
     Part part;
@@ -139,35 +138,6 @@ bool Block::moves(int dof, int last) const {
   return last == dof;
 }
 
-// A value of each environment; they lie `stride` apart in memory.
-inline V gather(const float* from, int64_t stride, const int* env) {
-  V out;
-  for (int l = 0; l < kLanes; ++l) out[l] = from[stride * env[l]];
-  return out;
-}
-
-template <int N>
-inline std::array<V, N> gather(const float* from, int64_t stride, const int* env) {
-  std::array<V, N> out;
-  for (int i = 0; i < N; ++i) out[i] = gather(from + i, stride, env);
-  return out;
-}
-
-inline std::array<V, 3> cross(const V* a, const V* b) {
-  return {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2],
-          a[0] * b[1] - a[1] * b[0]};
-}
-
-// The momentum of a body with the spatial inertia I that moves along m.
-inline void times_inertia(const std::array<V, 10>& I, const V* m, V* out) {
-  const V* offset = &I[6];
-  const auto tilt = cross(offset, m + 3), lift = cross(offset, m);
-  out[0] = I[0] * m[0] + I[3] * m[1] + I[4] * m[2] + tilt[0];
-  out[1] = I[3] * m[0] + I[1] * m[1] + I[5] * m[2] + tilt[1];
-  out[2] = I[4] * m[0] + I[5] * m[1] + I[2] * m[2] + tilt[2];
-  for (int k = 0; k < 3; ++k) out[3 + k] = I[9] * m[3 + k] - lift[k];
-}
-
 void Block::load(const Given& given, const int* env) {
   for (int i = 0; i < nv; ++i) {
     velocity[i] = gather(given.velocity + i, nv, env);
@@ -180,7 +150,7 @@ void Block::load(const Given& given, const int* env) {
 
 // M_ij = momentum of i's composite body along i, times the motion of its ancestor j.
 void Block::load_masses(const Given& given, const int* env) {
-  std::array<V, 10> inertia;
+  V10 inertia;
   for (int i = 0; i < nv; ++i) {
     for (int k = 0; k < 6; ++k)
       motion[6 * i + k] = gather(given.motion + 6 * i + k, 6 * nv, env);
@@ -204,33 +174,60 @@ void Block::load_masses(const Given& given, const int* env) {
   }
 }
 
+// The impedance of a contact, between `low` and `high`.
+V impeded(const Constants& k, V depth) {
+  const auto raised = [&](V x) {
+    if (k.power == 1.0f) return x;
+    if (k.power == 2.0f) return x * x;
+    for (int l = 0; l < kLanes; ++l) x[l] = std::pow(x[l], k.power);
+    return x;
+  };
+  const V x = choose(depth < 0.0f, -depth, depth) / k.width;
+  const V rising = raised(x) / std::pow(k.middle, k.power - 1.0f);
+  const V ending = 1.0f - raised(1.0f - x) / std::pow(1.0f - k.middle, k.power - 1.0f);
+  const V y = choose(x < k.middle, rising, ending);
+  const V between = clamp(k.low + y * (k.high - k.low), all(k.low), all(k.high));
+  return choose(x > 1.0f, all(k.high), between);
+}
+
 void Block::load_rows(const Given& given, const int* env) {
-  const int total = num_given + num_contacts();
-  for (int r = 0; r < num_rows; ++r) {
-    const int at = r < num_given ? r : num_given + (r - num_given) / 4;
-    D[r] = gather(given.D + at, total, env);
+  for (int r = 0; r < num_given; ++r) D[r] = gather(given.D + r, num_given, env);
+  for (int c = 0; c < num_contacts(); ++c) {
+    depth[c] = gather(given.dist + c, num_contacts(), env) - constants[c].margin;
+    touching[c] = any(depth[c] < 0.0f);
   }
+  rows.clear();
+  for (int r = 0; r < num_rows; ++r)
+    if (r < num_given || touching[(r - num_given) / 4]) rows.push_back(r);
   for (Part& part : parts) {
     const int size = part.size();
-    for (size_t r = 0; r < part.rows.size(); ++r) {
+    part.live.clear();
+    for (int r = 0; r < static_cast<int>(part.rows.size()); ++r) {
       const int row = part.rows[r];
       if (row >= num_given) {
+        const int c = (row - num_given) / 4;
+        if (!touching[c]) continue;
         if ((row - num_given) % 4 == 0) load_contact(part, r, given, env);
-        continue;
+      } else {
+        for (int i = 0; i < size; ++i)
+          part.J[r * size + i] = gather(given.J + int64_t(row) * nv + part.dofs[i],
+                                        int64_t(num_given) * nv, env);
       }
-      for (int i = 0; i < size; ++i)
-        part.J[r * size + i] = gather(given.J + int64_t(row) * nv + part.dofs[i],
-                                      int64_t(num_given) * nv, env);
+      part.live.push_back(r);
     }
   }
   times_rows(velocity, aref);
-  for (int r = 0; r < num_rows; ++r) {
-    const int c = (r - num_given) / 4;
-    if (r < num_given)
-      aref[r] = gather(given.aref + r, total, env);
-    else
-      aref[r] = gather(given.aref + num_given + c, total, env) -
-                gather(given.damping + c, num_contacts(), env) * aref[r];
+  for (int r = 0; r < num_given; ++r) aref[r] = gather(given.aref + r, num_given, env);
+  for (int c = 0; c < num_contacts(); ++c) {
+    if (!touching[c]) continue;
+    const Constants& k = constants[c];
+    const V deep = choose(depth[c] < 0.0f, depth[c], V{});
+    const V impedance = impeded(k, deep);
+    const V soft = k.weight * (1.0f - impedance) / impedance;
+    for (int r = num_given + 4 * c; r < num_given + 4 * c + 4; ++r) {
+      D[r] = 1.0f / choose(soft > kTiny, soft, all(kTiny));
+      aref[r] = -k.stiffness * impedance * deep - k.damping * aref[r];
+    }
   }
 }
 
@@ -238,11 +235,12 @@ void Block::load_rows(const Given& given, const int* env) {
 void Block::load_contact(Part& part, int r, const Given& given, const int* env) {
   const int c = (part.rows[r] - num_given) / 4, size = part.size();
   const int64_t count = num_contacts();
-  const auto frame = gather<9>(given.frame + 9 * c, 9 * count, env);
+  auto frame = gather<9>(given.frame + 9 * c, 9 * count, env);
+  for (V& x : frame) x = choose(depth[c] < 0.0f, x, V{});
   const auto point = gather<3>(given.point + 3 * c, 3 * count, env);
-  const auto friction = gather<2>(given.friction + 2 * c, 2 * count, env);
+  const float* friction = constants[c].friction;
   V* J = &part.J[r * size];
-  std::array<V, 3> offset;
+  V3 offset;
   int about = -1;
   for (int i = 0; i < size; ++i) {
     const int dof = part.dofs[i];
@@ -252,7 +250,7 @@ void Block::load_contact(Part& part, int r, const Given& given, const int* env) 
       const auto center = gather<3>(given.center + 3 * about, 3 * num_bodies, env);
       for (int k = 0; k < 3; ++k) offset[k] = point[k] - center[k];
     }
-    std::array<V, 3> edge{};  // how the dof moves along normal and tangents
+    V3 edge{};  // how the dof moves along normal and tangents
     if (apart) {
       auto speed = cross(&motion[6 * dof], offset.data());
       for (int k = 0; k < 3; ++k) speed[k] += motion[6 * dof + 3 + k];
@@ -288,7 +286,7 @@ void Block::times_mass(const std::vector<V>& in, std::vector<V>& out) const {
 void Block::times_rows(const std::vector<V>& in, std::vector<V>& out) const {
   for (const Part& part : parts) {
     const int size = part.size();
-    for (size_t r = 0; r < part.rows.size(); ++r) {
+    for (int r : part.live) {
       V sum{};
       for (int i = 0; i < size; ++i) sum += part.J[r * size + i] * in[part.dofs[i]];
       out[part.rows[r]] = sum;
@@ -303,14 +301,14 @@ inline I Block::active(int row, V of) const {
 // fronts = M + J^T W J, and y = -(gradient).
 void Block::assemble() {
   for (int i = 0; i < nv; ++i) y[i] = smooth[i] - mass_x[i];
-  for (int r = 0; r < num_rows; ++r)
+  for (int r : rows)
     weight[r] = choose(active(r, residual[r]), D[r], V{});
   for (Part& part : parts) {
     const int size = part.size();
     for (int i = 0; i < size; ++i)
       for (int j = 0; j <= i; ++j)
         part.front[i * size + j] = j < part.own ? part.mass[i * size + j] : V{};
-    for (size_t r = 0; r < part.rows.size(); ++r) {
+    for (int r : part.live) {
       const V w = weight[part.rows[r]];
       if (!any(w != 0.0f)) continue;
       const V pull = w * residual[part.rows[r]];
@@ -368,7 +366,7 @@ V Block::line_search(V gauss_1, V gauss_2) const {
   V low{}, high = all(4.0f), t = all(1.0f);
   for (int n = 0; n < kLineSearchIterations; ++n) {
     V first = gauss_1 + t * gauss_2, second = gauss_2;
-    for (int r = 0; r < num_rows; ++r) {
+    for (int r : rows) {
       const V at = residual[r] + t * slope[r];
       const V weighted = choose(active(r, at), D[r], V{}) * slope[r];
       first += weighted * at;
@@ -386,7 +384,7 @@ V Block::line_search(V gauss_1, V gauss_2) const {
 void Block::solve(const int* env, int count, float* qacc, float* force) {
   times_mass(x, mass_x);
   times_rows(x, residual);
-  for (int r = 0; r < num_rows; ++r) residual[r] -= aref[r];
+  for (int r : rows) residual[r] -= aref[r];
   I done{};
   for (int n = 0; n < iterations && any(~done); ++n) {
     assemble();
@@ -400,7 +398,7 @@ void Block::solve(const int* env, int count, float* qacc, float* force) {
     }
     const V step = choose(done, V{}, line_search(gauss_1, gauss_2));
     I same = ~I{};
-    for (int r = 0; r < num_rows; ++r) {
+    for (int r : rows) {
       const V moved = residual[r] + step * slope[r];
       same &= active(r, moved) == active(r, residual[r]);
       residual[r] = moved;
@@ -415,10 +413,12 @@ void Block::solve(const int* env, int count, float* qacc, float* force) {
   }
   for (int l = 0; l < count; ++l) {
     for (int i = 0; i < nv; ++i) qacc[int64_t(env[l]) * nv + i] = x[i][l];
-    for (int r = 0; r < num_rows; ++r) {
+    float* of_rows = force + int64_t(env[l]) * num_rows;
+    std::fill(of_rows, of_rows + num_rows, 0.0f);
+    for (int r : rows) {
       const float at = residual[r][l];
       const bool acts = r < num_equality || at < 0.0f;
-      force[int64_t(env[l]) * num_rows + r] = acts ? -D[r][l] * at : 0.0f * at;
+      of_rows[r] = acts ? -D[r][l] * at : 0.0f * at;
     }
   }
 }
@@ -427,26 +427,21 @@ using Floats = ffi::Buffer<ffi::F32>;
 
 ffi::Error Newton(Floats inertia, Floats motion, Floats center, Floats velocity,
                   Floats smooth, Floats start, Floats J, Floats D, Floats aref,
-                  Floats frame, Floats point, Floats friction, Floats damping,
+                  Floats dist, Floats frame, Floats point,
                   ffi::Buffer<ffi::S32> most, ffi::ResultBuffer<ffi::F32> qacc,
                   ffi::ResultBuffer<ffi::F32> force,
-                  ffi::Span<const int32_t> structure, ffi::Span<const float> armature) {
-  const Given given{inertia.typed_data(),  motion.typed_data(),   center.typed_data(),
-                    velocity.typed_data(), smooth.typed_data(),   start.typed_data(),
-                    J.typed_data(),        D.typed_data(),        aref.typed_data(),
-                    frame.typed_data(),    point.typed_data(),    friction.typed_data(),
-                    damping.typed_data()};
+                  ffi::Span<const int32_t> structure, ffi::Span<const float> numbers) {
+  const Given given{inertia.typed_data(),  motion.typed_data(), center.typed_data(),
+                    velocity.typed_data(), smooth.typed_data(), start.typed_data(),
+                    J.typed_data(),        D.typed_data(),      aref.typed_data(),
+                    dist.typed_data(),     frame.typed_data(),  point.typed_data()};
   // The same number for every environment of a batch.
-  Block block(structure, armature, most.typed_data()[0]);
+  Block block(structure, numbers, most.typed_data()[0]);
   const int64_t batch = smooth.element_count() / block.nv;
-  for (int64_t first = 0; first < batch; first += kLanes) {
-    int env[kLanes];
-    const int count = static_cast<int>(std::min<int64_t>(kLanes, batch - first));
-    for (int l = 0; l < kLanes; ++l)
-      env[l] = static_cast<int>(first) + std::min(l, count - 1);
+  for_each_block(batch, [&](const int* env, int count) {
     block.load(given, env);
     block.solve(env, count, qacc->typed_data(), force->typed_data());
-  }
+  });
   return ffi::Error::Success();
 }
 
@@ -467,9 +462,8 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(
         .Arg<Floats>()
         .Arg<Floats>()
         .Arg<Floats>()
-        .Arg<Floats>()
         .Arg<ffi::Buffer<ffi::S32>>()
         .Ret<Floats>()
         .Ret<Floats>()
         .Attr<ffi::Span<const int32_t>>("structure")
-        .Attr<ffi::Span<const float>>("armature"));
+        .Attr<ffi::Span<const float>>("numbers"));
