@@ -13,8 +13,8 @@ struct Shape {
   V3 axis() const { return {mat[2], mat[5], mat[8]}; }
 };
 
-// `dist` is negative in contact; `frame` has the normal and two tangents in its rows. What
-// is apart may have any of them, but a `dist` that says so.
+// `dist` is negative in contact; `frame` has the normal and two tangents in its rows. Of
+// geoms that are apart `dist` is positive, and the rest means nothing.
 struct Contact {
   V dist;
   V3 pos;

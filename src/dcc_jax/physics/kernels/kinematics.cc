@@ -33,6 +33,9 @@ struct Pose {
 struct Joint {
   int type, qpos, dof;  // where it begins in qpos and qvel
   float pos[3], axis[3], zero;
+
+  int turns() const { return type == kFree || type == kBall ? 3 : type == kHinge; }
+  int dofs() const { return type == kFree ? 6 : type == kBall ? 3 : 1; }
 };
 
 struct Body {
@@ -88,7 +91,7 @@ class Block {
 
  private:
   void place(int b, const Given& given, const int* env);
-  void move_axes(const Body& body, int b);
+  void move_axes(int b);
   void feel_inertia(int b);
   void resist(const Given& given, const int* env);
   void attach(const std::vector<Attached>& all, std::vector<V3>& at,
@@ -148,7 +151,7 @@ Block::Block(ffi::Span<const int32_t> structure, ffi::Span<const float> numbers)
       read.next(joint.axis, 3);
       read.next(&joint.zero, 1);
       at_q += joint.type == kFree ? 7 : joint.type == kBall ? 4 : 1;
-      at_v += joint.type == kFree ? 6 : joint.type == kBall ? 3 : 1;
+      at_v += joint.dofs();
     }
     body.tree_mass = body.mass;
   }
@@ -226,7 +229,7 @@ void Block::feel_inertia(int b) {
   const Body& body = bodies[b];
   const V9 turn = body.inertial.turned ? times(mat[b], body.inertial.mat) : mat[b];
   const V3 off = center[b] - tree_center[body.root];
-  const V square = off[0] * off[0] + off[1] * off[1] + off[2] * off[2];
+  const V square = dot(off, off);
   constexpr int row[] = {0, 1, 2, 0, 0, 1}, column[] = {0, 1, 2, 1, 2, 2};
   V10& out = inertia[b];
   for (int n = 0; n < 6; ++n) {
@@ -242,7 +245,8 @@ void Block::feel_inertia(int b) {
 }
 
 // How a body moves with each of its degrees of freedom, about the same centre.
-void Block::move_axes(const Body& body, int b) {
+void Block::move_axes(int b) {
+  const Body& body = bodies[b];
   for (const Joint& joint : body.joints) {
     int dof = joint.dof;
     if (joint.type == kSlide) {
@@ -255,10 +259,9 @@ void Block::move_axes(const Body& body, int b) {
         motion[dof] = {};
         motion[dof][3 + k] = all(1.0f);
       }
-    const int turns = joint.type == kHinge ? 1 : 3;
-    for (int k = 0; k < turns; ++k, ++dof) {
+    for (int k = 0; k < joint.turns(); ++k, ++dof) {
       V3 along = axis[joint.dof];
-      if (turns == 3) along = {mat[b][k], mat[b][3 + k], mat[b][6 + k]};
+      if (joint.type != kHinge) along = {mat[b][k], mat[b][3 + k], mat[b][6 + k]};
       const V3 lever = cross(along.data(), offset.data());
       motion[dof] = {along[0], along[1], along[2], lever[0], lever[1], lever[2]};
     }
@@ -286,7 +289,7 @@ void Block::resist(const Given& given, const int* env) {
         for (int k = 0; k < 6; ++k) v[k] += along[k];
         dof += 3;
       }
-      const V6 own = faster(dof, joint.type == kFree || joint.type == kBall ? 3 : 1);
+      const V6 own = faster(dof, joint.type == kFree ? 3 : joint.dofs());
       const V3 turned = cross(&v[0], &own[0]), carried = cross(&v[0], &own[3]),
                swept = cross(&v[3], &own[0]);
       for (int k = 0; k < 3; ++k) {
@@ -308,8 +311,7 @@ void Block::resist(const Given& given, const int* env) {
   }
   for (size_t b = bodies.size() - 1; b > 0; --b) {
     for (const Joint& joint : bodies[b].joints) {
-      const int count = joint.type == kFree ? 6 : joint.type == kBall ? 3 : 1;
-      for (int dof = joint.dof; dof < joint.dof + count; ++dof) {
+      for (int dof = joint.dof; dof < joint.dof + joint.dofs(); ++dof) {
         bias[dof] = V{};
         for (int k = 0; k < 6; ++k) bias[dof] += motion[dof][k] * force[b][k];
       }
@@ -334,7 +336,7 @@ void Block::compute(const Given& given, const int* env) {
   for (int b = 0; b < count; ++b) {
     feel_inertia(b);
     composite[b] = inertia[b];
-    move_axes(bodies[b], b);
+    move_axes(b);
   }
   for (int b = count - 1; b > 0; --b)
     for (int k = 0; k < 10; ++k) composite[bodies[b].parent][k] += composite[b][k];

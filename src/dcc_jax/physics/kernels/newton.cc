@@ -4,9 +4,9 @@
 // M and the rows of the contacts are made here, in the parts in which the solver wants
 // them: written out they are 4,500 numbers an environment, of which most are zero. The
 // algorithm, its stopping rule and its order of limbs and core are those of
-// contact_solver.py and arrowhead.py, which are the reference. What a
-// block of environments needs stays in the CPU's cache through all iterations. Contacts
-// that are apart in all of them are left out, rows that are inactive passed over.
+// contact_solver.py and arrowhead.py, which are the reference. What a block of
+// environments needs stays in the CPU's cache through all iterations. Contacts that are
+// apart in all of them are left out, rows that are inactive passed over.
 
 #include <algorithm>
 #include <cstring>
