@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -52,10 +53,12 @@ def draw(run_dirs: Sequence[Path], out: Path) -> None:
                 _line(axes, rows, name, label if len(runs) == 1 else f"{run} {label}")
         axes.set_title(title, fontsize=10)
         axes.set_xlabel("M tuples")
+        axes.set_visible(bool(axes.lines))
         if axes.lines and (len(names) > 1 or len(runs) > 1):
             axes.legend(fontsize=7)
     said = {name: verdict(rows) for name, rows in runs.items()}
-    figure.suptitle("\n".join(": ".join(filter(None, pair)) for pair in said.items()))
+    lines = (": ".join(filter(None, pair)) for pair in said.items())
+    figure.suptitle("\n".join(textwrap.fill(line, 140) for line in lines))
     figure.savefig(out, dpi=100)
     plt.close(figure)
 
