@@ -108,6 +108,24 @@ def test_log_takes_the_short_way_and_is_blind_to_the_sign():
     )
 
 
+@pytest.mark.parametrize("size", [1e-5, 1.0, np.pi, 4.0, 6.0])
+@pytest.mark.parametrize(("kind", "error"), [(np.float64, 1e-12), (np.float32, 3e-6)])
+def test_long_log_undoes_exp_up_to_a_whole_turn(size, kind, error):
+    w = random_vectors(3, 1.0)
+    w = (size * w / np.linalg.norm(w, axis=1, keepdims=True)).astype(kind)
+    found = jax.jit(lambda w: quat.long_log(quat.exp(w)))(w)
+    np.testing.assert_allclose(found, w, atol=error)
+
+
+@pytest.mark.parametrize("left", [1e-2, 1e-3, 2e-4, 1e-5, 0.0])
+def test_long_log_is_finite_next_to_a_whole_turn(left):
+    q = np.float32([np.cos(np.pi - left / 2), 0.0, np.sin(np.pi - left / 2), 0.0])
+    found = np.asarray(quat.long_log(q))
+    assert np.all(np.isfinite(found))
+    if left > 2e-4:
+        np.testing.assert_allclose(found, [0.0, 2 * np.pi - left, 0.0], atol=1e-4)
+
+
 @pytest.mark.parametrize("size", [0.0, 1e-6, 1e-4, 1.1e-4, 0.5])
 def test_exp_and_log_have_finite_gradients_that_undo_each_other(size):
     w = jnp.asarray(size * np.array([0.6, 0.0, 0.8]))

@@ -62,7 +62,15 @@ def log(q: Array) -> Array:
 
     q and -q give the same vector; its norm is at most pi. Differentiable at identity.
     """
-    q = jnp.where(q[..., :1] < 0.0, -q, q)
+    return long_log(jnp.where(q[..., :1] < 0.0, -q, q))
+
+
+def long_log(q: Array) -> Array:
+    """Rotation vector [..., 3] in rad of a unit quaternion, below a whole turn.
+
+    -q turns about the same axis, the other way round, and `exp(long_log(q)) == q`, but
+    for q = -1, whose axis is unknown: it gives zero.
+    """
     real, imag = q[..., :1], q[..., 1:]
     norm2 = jnp.sum(imag * imag, axis=-1, keepdims=True)
     small = norm2 < 1e-8
@@ -73,18 +81,19 @@ def log(q: Array) -> Array:
 
 
 def _angle(sine: Array, cosine: Array) -> Array:
-    """2 atan2(sine, cosine) of what is not negative, rad.
+    """2 atan2(sine, cosine), rad, of a sine that is positive.
 
     XLA has no vector code for arctan2 on a CPU. Here the angle is halved twice, by
     tan(a/2) = sin a / (cos a + 1), for which the series of Cephes' `atanf` suffices.
     """
     if sine.dtype == jnp.float64:
         return 2.0 * jnp.arctan2(sine, cosine)
-    x = sine / (cosine + jnp.sqrt(sine * sine + cosine * cosine))
+    x = sine / (jnp.abs(cosine) + jnp.sqrt(sine * sine + cosine * cosine))
     x = x / (1.0 + jnp.sqrt(1.0 + x * x))
     z = x * x
     series = ((8.05374449538e-2 * z - 1.38776856032e-1) * z + 1.99777106478e-1) * z
-    return 8.0 * (x + x * z * (series - 3.33329491539e-1))
+    angle = 8.0 * (x + x * z * (series - 3.33329491539e-1))
+    return jnp.where(cosine < 0.0, 2.0 * jnp.pi - angle, angle)
 
 
 def rotate(q: Array, v: Array) -> Array:

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dcc_jax import quat
+from dcc_jax.control.small_matrix import times
 
 Array = jax.Array
 
@@ -37,38 +38,44 @@ class JointRanges:
     def room(self, coords: quat.Coordinates, q_m: Array) -> Room:
         """What q_m [nq] leaves of the ranges."""
         pose = coords.split_q(q_m)[1][-len(self.lower) :]
+        pose = jnp.where(pose[:, :1] < 0.0, -pose, pose)
         r = quat.log(pose)
         lower = jnp.minimum(jnp.asarray(self.lower, r.dtype), r)
         upper = jnp.maximum(jnp.asarray(self.upper, r.dtype), r)
-        return Room(pose, r, lower, upper, second_coefficient(r))
+        return Room(
+            pose,
+            r,
+            lower,
+            upper,
+            per_lower=1.0 / jnp.maximum(r - lower, 1e-6),
+            per_upper=1.0 / jnp.maximum(upper - r, 1e-6),
+            turning=inverse_right_jacobian(r),
+        )
 
 
 @flax.struct.dataclass
 class Room:
     """Of J joints, for one q_m."""
 
-    pose: Array  # [J, 4] q_m
+    pose: Array  # [J, 4] q_m, the real part not negative
     r: Array  # [J, 3] rad, log(q_m)
     lower: Array  # [J, 3] rad
     upper: Array  # [J, 3] rad
-    second: Array  # [J, 1] coefficient of Jr^-1(r), see `second_coefficient`
+    per_lower: Array  # [J, 3] 1/rad, one over the way from r down to `lower`
+    per_upper: Array  # [J, 3] 1/rad, one over the way from r up to `upper`
+    turning: Array  # [J, 3, 3] Jr^-1(r)
 
-    def used(self, r: Array) -> Array:
-        """Share of its room [J] that a joint at the rotation vector r [J, 3] uses."""
-        way = r - self.r
-        room = jnp.where(way > 0.0, self.upper - self.r, self.r - self.lower)
-        return jnp.max(jnp.abs(way) / jnp.maximum(room, 1e-6), axis=-1)
+    def used(self, way: Array) -> Array:
+        """Share of its room [J] that a joint uses which is r + way, way [J, 3] rad."""
+        shares = jnp.maximum(way * self.per_upper, -way * self.per_lower)
+        return jnp.max(shares, axis=-1)
 
     def turned(self, u: Array) -> Array:
         """log(q_m u) [J, 3] of a displacement's quaternions [J, 4].
 
-        Beyond half a turn the rotation vector nearer to q_m's counts.
+        Beyond half a turn it goes on growing.
         """
-        r = quat.log(quat.mul(self.pose, u))
-        angle = jnp.sqrt(jnp.sum(r * r, axis=-1, keepdims=True) + 1e-12)
-        other = r * (1.0 - 2.0 * jnp.pi / angle)
-        nearer = _square(other - self.r) < _square(r - self.r)
-        return jnp.where(nearer, other, r)
+        return quat.long_log(quat.mul(self.pose, u))
 
 
 def bounded(coords: quat.Coordinates, room: Room, rest: Array) -> Array:
@@ -91,9 +98,13 @@ def bounded(coords: quat.Coordinates, room: Room, rest: Array) -> Array:
 
 
 def used(coords: quat.Coordinates, room: Room, tangent: Array) -> Array:
-    """Share of its room [J] that each joint of a displacement's tangent [nv] uses."""
+    """Share of its room [J] that each joint of a displacement's tangent [nv] uses.
+
+    Nor can it use more than half a turn: PD goes to its target the short way.
+    """
     joints = coords.split_v(tangent)[1][-len(room.r) :]
-    return room.used(room.r + inverse_right_jacobian(room.r, joints, room.second))
+    half_turns = jnp.sqrt(jnp.sum(joints * joints, axis=-1)) / jnp.pi
+    return jnp.maximum(room.used(times(room.turning, joints)), half_turns)
 
 
 def clip(coords: quat.Coordinates, room: Room, u: Array) -> Array:
@@ -111,24 +122,21 @@ def clip(coords: quat.Coordinates, room: Room, u: Array) -> Array:
 def softened(coords: quat.Coordinates, room: Room, u: Array) -> Array:
     """Whether a displacement [nq] uses more than `LINEAR_SHARE` of a joint's room."""
     joints = coords.split_q(u)[1][-len(room.r) :]
-    return jnp.any(room.used(room.turned(joints)) > LINEAR_SHARE)
+    return jnp.any(room.used(room.turned(joints) - room.r) > LINEAR_SHARE)
 
 
-def inverse_right_jacobian(r: Array, w: Array, second: Array) -> Array:
-    """Jr^-1(r) w [..., 3]: how fast log(q) changes from r when q turns with q' = q w.
+def inverse_right_jacobian(r: Array) -> Array:
+    """Jr^-1(r) [J, 3, 3]: how fast log(q) changes from r when q turns with q' = q w.
 
-    I + [r]x / 2 + second [r]x^2, with its `second_coefficient` [..., 1].
+    I + [r]x / 2 + c [r]x^2, c = 1 / a^2 - cot(a / 2) / (2 a), a = |r| below 2 pi.
     """
-    once = jnp.cross(r, w)
-    return w + 0.5 * once + second * jnp.cross(r, once)
-
-
-def second_coefficient(r: Array) -> Array:
-    """1 / a^2 - cot(a / 2) / (2 a) [..., 1], a = |r| below 2 pi."""
-    a2 = _square(r)
+    a2 = _square(r)[:, :, None]
     small = a2 < 1e-4
     a = jnp.sqrt(jnp.where(small, 1.0, a2))
-    return jnp.where(small, 1.0 / 12.0, 1.0 / a**2 - 0.5 / (a * jnp.tan(0.5 * a)))
+    c = jnp.where(small, 1.0 / 12.0, 1.0 / a**2 - 0.5 / (a * jnp.tan(0.5 * a)))
+    eye = jnp.eye(3, dtype=r.dtype)
+    cross = jnp.cross(r[:, None, :], eye).mT
+    return eye + 0.5 * cross + c * (r[:, :, None] * r[:, None, :] - a2 * eye)
 
 
 def _shortened(used: Array) -> Array:
