@@ -12,7 +12,7 @@ import pytest
 
 from dcc_jax.character import asset_path, compose_scene, load_character
 from dcc_jax.control.stiffness import softened_gains
-from dcc_jax.evaluate import drag, show_drag
+from dcc_jax.evaluate import drag, rest, show_drag
 from dcc_jax.evaluate.dragging import BODIES, DIRECTIONS, NEWTONS, Trials
 from dcc_jax.motion.clip import load_clip
 
@@ -29,21 +29,16 @@ def yielding(factor: float):
     """
 
     def play(run, trials, alpha, seed):
-        kp = softened_gains(CHARACTER.kp, CHARACTER.column_weight, alpha)
+        kp = factor_of_gains(alpha, factor)
         q = np.zeros((STEPS, len(trials.body), MODEL.nq))
-        data, J = mujoco.MjData(MODEL), np.zeros((3, MODEL.nv))
         for k, (episode, body, force) in enumerate(
             zip(trials.episode, trials.body, trials.force, strict=True)
         ):
-            data.qpos[:] = POSES[7 * episode]
+            pose = POSES[7 * episode].astype(float)
             tangent = np.zeros(MODEL.nv)
             if body >= 0:
-                mujoco.mj_forward(MODEL, data)
-                at = MODEL.body(BODIES[body]).id
-                mujoco.mj_jac(MODEL, data, J, None, data.xipos[at], at)
-                tangent[6:] = factor * (J.T @ force)[6:] / kp[6:]
+                tangent[6:] = rested(pose, BODIES[body], force, kp)
                 tangent[:3] = force / 1000.0
-            pose = POSES[7 * episode].astype(float)
             mujoco.mj_integratePos(MODEL, pose, tangent, 1.0)
             q[:, k] = pose
         return q, np.zeros(len(trials.body), bool)
@@ -51,11 +46,28 @@ def yielding(factor: float):
     return play
 
 
+def factor_of_gains(alpha: float, factor: float) -> np.ndarray:
+    return softened_gains(CHARACTER.kp, CHARACTER.column_weight, alpha)[6:] / factor
+
+
+def rested(pose: np.ndarray, body: str, force: np.ndarray, kp: np.ndarray):
+    """Rotation vectors [36] at which joints with gains kp rest, with J there."""
+    data, J = mujoco.MjData(MODEL), np.zeros((3, MODEL.nv))
+    at, y = MODEL.body(body).id, np.zeros(MODEL.nv)
+    for _ in range(40):
+        data.qpos[:] = pose
+        mujoco.mj_integratePos(MODEL, data.qpos, y, 1.0)
+        mujoco.mj_forward(MODEL, data)
+        mujoco.mj_jac(MODEL, data, J, None, data.xipos[at], at)
+        y[6:] += 0.5 * ((J.T @ force)[6:] / kp - y[6:])
+    return y[6:]
+
+
 def measured(alpha: float, factor: float = 1.0) -> drag.Drag:
     environment = SimpleNamespace(scene=SimpleNamespace(character=CHARACTER))
     trials = Trials.of(2)
-    # Small, so that Eq. (7) is linear.
-    trials = Trials(trials.episode, trials.body, 0.05 * trials.force)
+    # So small that no joint comes near the end of its range.
+    trials = Trials(trials.episode, trials.body, 0.02 * trials.force)
     plan = SimpleNamespace(environment=environment, trials=trials, run=None, seed=0)
     return drag._measured(plan, alpha, yielding(factor))
 
@@ -70,6 +82,39 @@ def test_who_yields_by_eq_7_is_as_stiff_as_theory_says():
         value = found.stiffness(body)
         assert value.low <= value.value <= value.high
         assert value.value == pytest.approx(found.expected(body), rel=0.02)
+
+
+@pytest.mark.parametrize(("body", "newtons"), [("left_hand", 40.0), ("head", 60.0)])
+def test_rest_under_a_large_force_is_where_springs_have_it(body, newtons):
+    """C MuJoCo, pelvis held, a spring in every joint, settled."""
+    alpha, force = 0.5, np.array([0.8 * newtons, 0.6 * newtons, 0.0])
+    kp = factor_of_gains(alpha, 1.0)
+    spec = CHARACTER.spec()
+    spec.option.gravity[:] = 0.0
+    spec.option.timestep = 0.002
+    model = spec.compile()
+    pose = POSES[0].astype(float)
+    pose[:7] = model.qpos0[:7]
+    model.qpos_spring[:] = pose
+    model.jnt_stiffness[1:] = kp[::3]
+    model.dof_damping[6:] = 0.3 * kp
+    model.body_mass[1], model.body_inertia[1] = 1e6, 1e6
+    model.jnt_limited[:] = 0
+    data = mujoco.MjData(model)
+    data.qpos[:] = pose
+    at = model.body(body).id
+    mujoco.mj_forward(model, data)
+    before = data.xipos[at] - data.qpos[:3]
+    data.xfrc_applied[at, :3] = force
+    mujoco.mj_step(model, data, 2000)
+    assert np.abs(data.qvel[6:]).max() < 1e-3
+    expected = data.xipos[at] - data.qpos[:3] - before
+    (found,) = rest.yields_at_rest(
+        CHARACTER, (body,), alpha, pose[None], force[None], np.zeros(1, int)
+    )
+    assert np.linalg.norm(expected) > 0.04
+    error = np.linalg.norm(found - expected)
+    assert error < 0.01 * np.linalg.norm(expected)
 
 
 def test_who_yields_half_as_far_is_twice_as_stiff_and_not_near():
@@ -95,6 +140,22 @@ def test_every_body_direction_and_force_is_tried_in_every_episode():
     alone = trials.body < 0
     assert list(trials.episode[alone]) == [0, 1, 2] and not trials.force[alone].any()
     assert len({tuple(f) for f in trials.force[~alone]}) == 6 * len(NEWTONS)
+
+
+def test_a_trial_that_falls_at_one_level_counts_for_the_slope_at_none():
+    drags = [measured(a) for a in (0.0, 0.5)]
+    fallen = np.flatnonzero(drags[1].body == 0)[:60]
+    drags[1].fell[fallen] = True
+    drags[1].measured[fallen] = np.nan
+    drags[0].measured[fallen] = 1e-3
+    assert drag.slope(drags, "left_hand") == pytest.approx(1.0, abs=0.02)
+
+
+def test_small_yields_can_be_left_out():
+    found = measured(0.5)
+    everything, far = found.at("left_hand"), found.at("left_hand", 0.005)
+    assert 0 < len(far) < len(everything)
+    assert np.all(found.newtons[far] / found.theory[far] >= 0.005)
 
 
 def test_who_fell_does_not_count():

@@ -58,6 +58,7 @@ __all__ = [
     "greatest_alpha",
     "measured",
     "whole_yield",
+    "yield_at_rest",
 ]
 
 Array = jax.Array
@@ -169,16 +170,30 @@ def admittance(
     chex.assert_shape(J, (None, 3, controller.coords.nv))
     coords, dt = controller.coords, controller.dt
     torque = jnp.sum(transpose_times(J, forces), axis=0)
-    softer, share = _softening(controller, alpha, J.dtype)
-    rest = softer * torque / jnp.asarray(controller.kp, J.dtype)
-    if room is not None:
-        rest = ranges.bounded(coords, room, rest)
+    rest = yield_at_rest(controller, torque, alpha, room)
+    _, share = _softening(controller, alpha, J.dtype)
     yd = _sprung(controller, displacement.y - rest, displacement.yd)
     y = displacement.y + dt * yd
     u = quat.exp_map(coords, share * y)
     if room is not None:
         u = ranges.clip(coords, room, u)
     return Displacement(u=u, ud=share * yd, y=y, yd=yd)
+
+
+def yield_at_rest(
+    controller: Controller, torque: Array, alpha: Array, room: Room | None
+) -> Array:
+    """y* [nv], m and rad, of `admittance` under generalized forces `torque` [nv].
+
+    Args:
+        controller: of the character.
+        torque: J^T f, summed over the forces.
+        alpha: level of compliance, in [0, 1) (unchecked: it is traced).
+        room: of the reference, that the yield stays in.
+    """
+    softer, _ = _softening(controller, alpha, torque.dtype)
+    rest = softer * torque / jnp.asarray(controller.kp, torque.dtype)
+    return rest if room is None else ranges.bounded(controller.coords, room, rest)
 
 
 def greatest_alpha(

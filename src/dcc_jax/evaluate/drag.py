@@ -2,8 +2,8 @@
 
 A force ramps up at a body, holds and lets go, while the trained policy balances and
 walks. The yield is how far the body's centre of mass moves relative to the pelvis, in
-the pelvis's frame, against the same episode without the force. It is compared with the
-stiffness that Eq. (7) gives at the poses of that episode.
+the pelvis's frame, against the same episode without the force. It is compared with what
+Eq. (7) has at the poses of that episode, see `rest`.
 Letters: K trials, T control steps, E episodes.
 """
 
@@ -15,28 +15,25 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dcc_jax import quat
-from dcc_jax.character import CONTROL_RATE, Character, compose_scene
-from dcc_jax.control.stiffness import softened_gains, stiffness
-from dcc_jax.env import features
+from dcc_jax.character import CONTROL_RATE, Character
 from dcc_jax.env.environment import Environment
-from dcc_jax.evaluate import bootstrap
+from dcc_jax.evaluate import bootstrap, rest
 from dcc_jax.evaluate.bootstrap import Interval
 from dcc_jax.evaluate.dragging import BODIES, Dragging, Trials
 from dcc_jax.play.pull import Pulled
 from dcc_jax.play.runs import Run, find_run, make_environment
-
-Array = jax.Array
 
 LEVELS = (0.0, 0.16, 0.3, 0.5, 0.7, 0.8)
 AVERAGED = 1.0  # s, the last of the hold: a stride of a walk
 NEAR = 0.25
 """A trial whose stiffness is within this share of theory's delivers it (as the field
 counts it)."""
+SEEN = 0.01
+"""m, the yield of a trial that is seen: of those below, balance moves a body by as
+much."""
 
 
 @dataclass(frozen=True)
@@ -48,16 +45,18 @@ class Drag:
     episode: np.ndarray  # [K]
     newtons: np.ndarray  # [K]
     measured: np.ndarray  # [K] N/m, force over the yield along it; NaN where it fell
-    theory: np.ndarray  # [K] N/m, by Eq. (7) and the weights
+    theory: np.ndarray  # [K] N/m, the force over the yield along it by Eq. (7)
     fell: np.ndarray  # [K] bool, in it or in the same episode without a force
 
-    def at(self, body: str) -> np.ndarray:
-        """The trials at a body that ended upright, indices."""
-        return np.flatnonzero((self.body == BODIES.index(body)) & ~self.fell)
+    def at(self, body: str, least: float = 0.0) -> np.ndarray:
+        """The trials at a body that ended upright, indices, and for which theory has a
+        yield of at least so many m."""
+        far = self.newtons >= least * self.theory
+        return np.flatnonzero((self.body == BODIES.index(body)) & ~self.fell & far)
 
-    def share_near(self, body: str) -> Interval:
-        """Of the trials at a body, those within `NEAR` of theory."""
-        at = self.at(body)
+    def share_near(self, body: str, least: float = 0.0) -> Interval:
+        """Of the trials at a body, as of `at`, those within `NEAR` of theory."""
+        at = self.at(body, least)
         if not len(at):
             return Interval(np.nan, np.nan, np.nan)
         return bootstrap.share(np.abs(self.measured[at] / self.theory[at] - 1.0) < NEAR)
@@ -143,13 +142,18 @@ def execute(
 
 
 def slope(drags: Sequence[Drag], body: str) -> float:
-    """Of log measured over log theoretical median stiffness at a body, over alpha."""
-    found = np.log([d.stiffness(body).value for d in drags])
-    expected = np.log([d.expected(body) for d in drags])
-    good = np.isfinite(found) & np.isfinite(expected)
-    if good.sum() < 2:
+    """Of log measured over log theoretical median stiffness at a body, over alpha.
+
+    Of the trials that ended upright at every level: those that fall when it is soft
+    are the soft ones.
+    """
+    upright = ~np.any([drag.fell for drag in drags], axis=0)
+    at = np.flatnonzero((drags[0].body == BODIES.index(body)) & upright)
+    if len(drags) < 2 or not len(at):
         return np.nan
-    return float(np.polyfit(expected[good], found[good], 1)[0])
+    found = np.log([np.median(drag.measured[at]) for drag in drags])
+    expected = np.log([np.median(drag.theory[at]) for drag in drags])
+    return float(np.polyfit(expected, found, 1)[0])
 
 
 def _measured(plan: DragPlan, alpha: float, play: Dragging) -> Drag:
@@ -165,9 +169,7 @@ def _measured(plan: DragPlan, alpha: float, play: Dragging) -> Drag:
     away = seen[:, pulled][:, each, body] - seen[:, alone][:, each, body]
     along = np.einsum("tkji,kj->tki", turn[:, pulled], force)  # N, in its frame
     yields = np.sum(away * along, axis=-1).mean(axis=0) / newtons
-    C = _compliances(character, q[:, ~pulled], alpha)
-    f = along.mean(axis=0)
-    expected = np.einsum("ki,kij,kj->k", f, C[alone, body], f) / newtons
+    expected = _expected(character, q[:, alone], along, body, alpha)
     fell = ended[pulled] | ended[alone]
     with np.errstate(divide="ignore"):
         found = np.where(fell, np.nan, newtons / yields)
@@ -177,35 +179,30 @@ def _measured(plan: DragPlan, alpha: float, play: Dragging) -> Drag:
 def _from_pelvis(character: Character, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Centres of mass [T, K, bodies, 3] in the pelvis's frame, m, and its rotation
     [T, K, 3, 3], at coordinates [T, K, 55]."""
-    model = compose_scene(character, floor=False)
-    kinematics = features.Kinematics.of(model)
-    at = [character.body_names.index(name) for name in BODIES]
-    offset = jnp.array([model.body(name).ipos for name in BODIES], jnp.float32)
-
-    @jax.jit
-    def seen(q: Array) -> Array:
-        pos_w, quat_w = features.body_poses(kinematics, q)
-        point_w = pos_w[jnp.array(at)] + quat.rotate(quat_w[jnp.array(at)], offset)
-        return quat.rotate(quat.inv(q[3:7]), point_w - q[:3])
-
+    bodies = rest.Bodies(character, BODIES)
     turn = Rotation.from_quat(q[..., 3:7].reshape(-1, 4), scalar_first=True)
-    points = np.asarray(jax.vmap(jax.vmap(seen))(q))
+    points = np.asarray(jax.jit(jax.vmap(jax.vmap(bodies.centers)))(q))
     return points, turn.as_matrix().reshape(*q.shape[:2], 3, 3)
 
 
-def _compliances(character: Character, q: np.ndarray, alpha: float) -> np.ndarray:
-    """K_hat^-1 [E, bodies, 3, 3] in the pelvis's frame, mean over the poses [T, E, 55].
-
-    Every fifth pose: a stride has a dozen.
-    """
-    model = compose_scene(character, floor=False)
-    kp = softened_gains(character.kp, character.column_weight, alpha)
-    found = np.zeros((q.shape[1], len(BODIES), 3, 3))
-    poses = q[::5].astype(float)
-    poses[..., :7] = model.qpos0[:7]
-    for e, b in np.ndindex(*found.shape[:2]):
-        point = model.body(BODIES[b]).ipos
-        for pose in poses[:, e]:
-            K = stiffness(model, pose, BODIES[b], point, kp)
-            found[e, b] += np.linalg.inv(K) / len(poses)
-    return found
+def _expected(
+    character: Character,
+    q: np.ndarray,
+    force: np.ndarray,
+    body: np.ndarray,
+    alpha: float,
+) -> np.ndarray:
+    """Yields along the force [K], m, that theory has: the mean over poses q [T, K, 55]
+    under forces [T, K, 3] in the pelvis's frame. Every fifth: a stride has a dozen."""
+    q, force = q[::5], force[::5]
+    times = len(q)
+    moved = rest.yields_at_rest(
+        character,
+        BODIES,
+        alpha,
+        q.reshape(-1, q.shape[-1]),
+        force.reshape(-1, 3),
+        np.tile(body, times),
+    ).reshape(force.shape)
+    newtons = np.linalg.norm(force, axis=-1)
+    return (np.sum(moved * force, axis=-1) / newtons).mean(axis=0)

@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from dcc_jax.evaluate.drag import NEAR, Drag, slope
+from dcc_jax.evaluate.drag import NEAR, SEEN, Drag, slope
 from dcc_jax.evaluate.dragging import BODIES
 
 COLOURS = ("#1f6fb4", "#c8553d", "#3a7d44", "#8a5fb0")
@@ -27,12 +27,14 @@ def table(name: str, drags: Sequence[Drag]) -> Table:
         "theory, N/m",
         "measured, N/m [95 %]",
         f"within {NEAR:.0%} [95 %]",
+        f"of yields from {100 * SEEN:g} cm on",
         "fell",
     ):
         page.add_column(column, justify="left" if column == "body" else "right")
     for body in BODIES:
         for drag in drags:
-            found, near = drag.stiffness(body), drag.share_near(body)
+            found = drag.stiffness(body)
+            near, seen = drag.share_near(body), drag.share_near(body, SEEN)
             fell = drag.fell[drag.body == BODIES.index(body)].mean()
             page.add_row(
                 body,
@@ -40,6 +42,7 @@ def table(name: str, drags: Sequence[Drag]) -> Table:
                 f"{drag.expected(body):.0f}",
                 f"{found.value:.0f} [{found.low:.0f}, {found.high:.0f}]",
                 f"{near.value:.0%} [{near.low:.0%}, {near.high:.0%}]",
+                f"{seen.value:.0%} [{seen.low:.0%}, {seen.high:.0%}]",
                 f"{fell:.0%}",
             )
         if len(drags) > 1:
