@@ -4,7 +4,7 @@ A force pushes the chest for a tenth of a second; direction and impulse are draw
 episode. Who stands 3 s later has survived. A logistic curve over the impulse, fitted in
 each of eight sectors, says where half of them fall. Arms as in `soft_contact.py`.
 
-    python experiments/survivable_impulse.py sustained-push --alpha 0.5
+    python experiments/survivable_impulse.py sustained-push --alpha 0 0.5
 """
 
 from __future__ import annotations
