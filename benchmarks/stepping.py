@@ -59,18 +59,28 @@ def compiled(function: Callable, *batch: Any) -> Callable[[], Any]:
 
 def compiled_batch(function: Callable, *batch: Any) -> Callable[[], Any]:
     """`function` of a device's share of a batch, compiled for all devices."""
+    program, batch = placed(function, *batch)
+    return lambda: jax.block_until_ready(program(*batch))
+
+
+def placed(function: Callable, *batch: Any) -> tuple[jax.stages.Compiled, tuple]:
+    """The compiled program, and the batch where it wants it."""
     spec = PartitionSpec("env")
     mesh = Mesh(np.array(jax.devices()), ("env",))
     mapped = jax.shard_map(
         function, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
     )
     batch = jax.device_put(batch, NamedSharding(mesh, spec))
-    program = jax.jit(mapped).lower(*batch).compile()
-    return lambda: jax.block_until_ready(program(*batch))
+    return jax.jit(mapped).lower(*batch).compile(), batch
 
 
 def ours(job: Job) -> Callable[[], physics.State]:
     """Our physics step, without compliance."""
+    return compiled(our_steps(job), job.states, job.drive)
+
+
+def our_steps(job: Job) -> Callable[[physics.State, Drive], physics.State]:
+    """Of ONE environment."""
     scene = job.scene
 
     def step(state: physics.State, drive: Drive) -> tuple[physics.State, None]:
@@ -81,7 +91,7 @@ def ours(job: Job) -> Callable[[], physics.State]:
     def steps(state: physics.State, drive: Drive) -> physics.State:
         return jax.lax.scan(step, state, drive)[0]
 
-    return compiled(steps, job.states, job.drive)
+    return steps
 
 
 def naive_mjx(job: Job) -> Callable[[], mjx.Data]:
