@@ -29,6 +29,8 @@ def make(task: str, imitation: str):
         ("door", "adversarial", False, True, PHASE_SIZE),
         ("hand-in-hand", "task", True, True, 0),
         ("hand-in-hand", "adversarial", False, True, 0),
+        ("sustained-push", "task", False, True, 0),
+        ("sustained-push", "tracking", True, True, 0),
     ],
 )
 def test_a_setting_says_who_judges(task, imitation, tracks, follows, condition):

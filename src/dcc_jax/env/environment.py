@@ -340,7 +340,8 @@ def imitation(task: Task, config: EnvConfig) -> str:
     """`adversarial` or `tracking`: what r_q is with a task and a configuration."""
     if config.imitation != "task":
         return config.imitation
-    return "tracking" if task.follows_reference else "adversarial"
+    tracks = task.follows_reference and task.tracks
+    return "tracking" if tracks else "adversarial"
 
 
 def follows_reference(task: Task, config: EnvConfig) -> bool:

@@ -58,7 +58,10 @@ class Task:
     follows_reference: ClassVar[bool] = False
     """Whether the reference goes on in time (Sec. 5.4 and Appendix): the root's target
     and the world are where `reference` has them. `env.imitation` says whether its pose
-    is tracked as well, which is the default then, or the discriminator judges."""
+    is tracked as well, or the discriminator judges."""
+    tracks: ClassVar[bool] = True
+    """Of a reference that goes on in time: whether its pose is tracked unless
+    `env.imitation` says otherwise."""
     trackable: ClassVar[bool] = True
     """Whether `env.imitation tracking` makes sense: clips or planner have a pose for
     every moment of the task."""

@@ -3,12 +3,10 @@
 Every now and then a force of constant direction acts on one body for a while, as wind
 or a dog on a lead would. It is fed to the compliance as it is. The reference goes along
 a path with stops, turns and changes of speed: a planner blends loops of walking and
-running by its speed (`tasks.strides`), and the character follows in time. The path
-waits for who is left behind and gives way to who is carried off: it goes on from within
-`leash` of the character.
-
-Departure: the paper learns this skill with the discriminator (Sec. 4.1) and leaves the
-planner to its Appendix; as in `tasks.hand_in_hand`.
+running by its speed (`motion.planner`), of which the reward takes where the root should
+be, Eq. (14), and the discriminator judges the motion (Sec. 4.1). The path waits for who
+is left behind and gives way to who is carried off: it goes on from within `leash` of
+the character. `env.imitation tracking` has the planner's pose tracked as well.
 """
 
 from __future__ import annotations
@@ -50,6 +48,7 @@ class SustainedPush(Task):
     name: ClassVar[str] = "sustained-push"
     clips: ClassVar[tuple[str, ...]] = planner.LOOPS
     follows_reference: ClassVar[bool] = True
+    tracks: ClassVar[bool] = False
     conditions_on_phase: ClassVar[bool] = False
     state_size: ClassVar[int] = locomotion.SEEN
     clock: ClassVar[str | None] = "since_push"
