@@ -165,3 +165,38 @@ def test_alpha_is_drawn_from_its_range_and_observed(environment):
     alpha = np.asarray(states.alpha)
     assert alpha.min() >= 0.1 and alpha.max() <= 0.5 and np.ptp(alpha) > 0.3
     np.testing.assert_array_equal(states.obs[:, ALPHA_ENTRY], alpha)
+
+
+def test_the_discriminator_sees_a_pose_without_all_that_forces_made_it_yield(
+    environment, start
+):
+    """Also what PD gives way by, of which u is a share alone (Eq. (6))."""
+    rng = np.random.default_rng(0)
+    coords, scene = environment.kinematics.coords, environment.scene
+    y = 0.2 * rng.normal(size=coords.nv).astype(np.float32)
+    y[[2, 3, 4, 5]] = 0.0  # what of the root is not displaced
+    whole = quat.exp_map(coords, jnp.asarray(y))
+    u = quat.exp_map(coords, jnp.asarray(0.5 * y))
+
+    def observed(u, y, away):
+        q = scene.character_qpos(start.body.qpos)
+        qpos = start.body.qpos.at[scene.qpos_adr : scene.qpos_adr + coords.nq].set(
+            quat.oplus(coords, q, away)
+        )
+        return environment.observed(
+            dataclasses.replace(
+                start,
+                body=dataclasses.replace(start.body, qpos=qpos),
+                q_previous=quat.oplus(coords, start.q_previous, away),
+                displacement=dataclasses.replace(start.displacement, u=u, y=y),
+                u_previous=u,
+                yield_previous=quat.exp_map(coords, y),
+            )
+        )
+
+    rest = quat.identity(coords)
+    at_rest = observed(rest, jnp.zeros(coords.nv), rest)
+    yielded = observed(u, jnp.asarray(y), whole)
+    np.testing.assert_allclose(yielded.features, at_rest.features, atol=2e-5)
+    # The policy's own numbers have u taken off, as in the paper.
+    assert np.abs(yielded.obs[:270] - at_rest.obs[:270]).max() > 0.01

@@ -124,6 +124,7 @@ class Environment:
             body=body,
             displacement=displacement,
             u_previous=displacement.u,
+            yield_previous=displacement.u,
             q_previous=start.qpos_previous,
             start=RootTarget(start.qpos[:2], start.travel),
             reference=reference,
@@ -200,6 +201,7 @@ class Environment:
             reference=inputs.reference,
             q_previous=self.scene.character_qpos(state.body.qpos),
             u_previous=state.displacement.u,
+            yield_previous=compliance.whole_yield(self.controller, state.displacement),
             previous_features=state.features,
             metrics=metrics.metrics(
                 end.sums,
@@ -264,14 +266,27 @@ class Environment:
         return quat.oplus(coords, pose, quat.exp_map(coords, tangent))
 
     def observed(self, state: EnvState) -> EnvState:
-        """Fills in the features and the observation."""
-        obs, body_features = observation.observation(
+        """Fills in the features and the observation.
+
+        Departure: from what the discriminator sees, the paper takes u off. Here
+        `compliance.whole_yield` goes, as in `outcome.tracking`: of a pose that has u
+        alone taken off, what PD gives way by is no part of any clip, and a policy that
+        works against it would be paid.
+        """
+        obs = observation.observation(
             self.task,
             self.scene,
             self.kinematics,
             state,
             self._root_target(state),
             self.has_phase,
+        )
+        body_features = features.unyielded(
+            self.kinematics,
+            self.scene.character_qpos(state.body.qpos),
+            state.q_previous,
+            compliance.whole_yield(self.controller, state.displacement),
+            state.yield_previous,
         )
         first = state.time == 0.0
         return dataclasses.replace(

@@ -180,7 +180,23 @@ def body_features(kinematics: Kinematics, q: Array, q_previous: Array) -> Array:
 def state(
     kinematics: Kinematics, q: Array, q_previous: Array, u: Array, u_previous: Array
 ) -> Array:
-    """The paper's 306 numbers of q (-) u: `body_features`, then log u of the joints.
+    """The paper's 306 numbers of q (-) u: `unyielded`, then log u of the joints.
+
+    Args:
+        kinematics: the character's tree.
+        q: simulated coordinates now [55].
+        q_previous: the same, one control step ago.
+        u: displacement now [55].
+        u_previous: displacement one control step ago.
+    """
+    bodies = unyielded(kinematics, q, q_previous, u, u_previous)
+    return jnp.concatenate([bodies, quat.log_map(kinematics.coords, u)[6:]])
+
+
+def unyielded(
+    kinematics: Kinematics, q: Array, q_previous: Array, u: Array, u_previous: Array
+) -> Array:
+    """`body_features` [270] of q (-) u.
 
     From each pose the displacement of its own time is taken off. A character that
     follows q_m (+) u exactly then yields the features of the clip exactly, which is
@@ -191,16 +207,16 @@ def state(
         kinematics: the character's tree.
         q: simulated coordinates now [55].
         q_previous: the same, one control step ago.
-        u: displacement now [55].
-        u_previous: displacement one control step ago.
+        u: what forces have the pose away from the reference now [55]; for the
+            discriminator the whole yield, see `Environment.observed`.
+        u_previous: the same, one control step ago.
     """
     coords = kinematics.coords
-    bodies = body_features(
+    return body_features(
         kinematics,
         quat.ominus(coords, q, u),
         quat.ominus(coords, q_previous, u_previous),
     )
-    return jnp.concatenate([bodies, quat.log_map(coords, u)[6:]])
 
 
 def _two_columns(orientation: Array) -> Array:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from dcc_jax import physics, quat
 from dcc_jax.env import features
-from dcc_jax.env.features import FEATURE_SIZE, STATE_SIZE, Kinematics
+from dcc_jax.env.features import STATE_SIZE, Kinematics
 from dcc_jax.env.state import EnvState
 from dcc_jax.env.task import RootTarget, Task
 
@@ -35,8 +35,8 @@ def observation(
     state: EnvState,
     target: RootTarget,
     has_phase: bool,
-) -> tuple[Array, Array]:
-    """The observation [O] of a state, and its features [270].
+) -> Array:
+    """The observation [O] of a state.
 
     Args:
         task: of the environment.
@@ -59,7 +59,7 @@ def observation(
         of_phase(state.reference.phase) if has_phase else jnp.zeros(0),
         task.observe(scene, state.task, state.body),
     ]
-    return jnp.concatenate(parts), numbers[:FEATURE_SIZE]
+    return jnp.concatenate(parts)
 
 
 def of_phase(phase: Array) -> Array:
