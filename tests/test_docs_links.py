@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from dcc_jax.env.config import EnvConfig
+from dcc_jax.env.environment import imitation
 from dcc_jax.tasks import TASKS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -103,7 +105,8 @@ def test_every_skill_has_a_page_with_its_sections_and_its_place_in_the_tables():
 
 @pytest.mark.parametrize("name", list(TASKS))
 def test_a_page_says_by_what_its_skill_is_taught(name):
-    taught = "tracking" if TASKS[name].follows_reference else "discriminator"
+    judge = imitation(TASKS[name](), EnvConfig())
+    taught = "tracking" if judge == "tracking" else "discriminator"
     row = rf"\[{name}\]\([^)]*\) \| {taught} \|"
     assert re.search(row, (ROOT / "README.md").read_text())
     page = (DOCS / "skills" / f"{name}.md").read_text()

@@ -25,7 +25,7 @@ _PATIENCE = {
     "--xla_cpu_collective_call_terminate_timeout_seconds": 86400,
 }
 
-# Fusions compiled by XLA's older emitter run faster: a training by a fifth
+# Fusions compiled by XLA's older emitter run faster and compile sooner
 # (docs/performance.md). XLA aborts on a flag that it does not know, and jax 0.12 no
 # longer knows this one.
 _WITH_OLDER_FUSIONS = "0.9."
