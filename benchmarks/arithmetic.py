@@ -1,6 +1,6 @@
 """How far the kernels are from what the arithmetic in them takes on this CPU.
 
-    python benchmarks/arithmetic.py [TASK ...] [--rounds 200]
+    python benchmarks/arithmetic.py [TASK ...] [--rounds 40]
 
 Operations are counted, not estimated: the kernels are compiled once more with numbers
 that count (`counted.h`), and make the same physics step in the states that a training
@@ -23,10 +23,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from dcc_jax import runtime
 
@@ -54,15 +51,6 @@ HERE = Path(__file__).parent
 COUNTER = 'extern "C" uint64_t counted_{0}() {{ return operations; }}\n'
 
 
-def built(folder: Path, sources: list[Path], name: str) -> Path:
-    """A shared library of sources in `folder`."""
-    library = folder / name
-    command = [*native._compiler(), *native.FLAGS, f"-I{jax.ffi.include_dir()}"]
-    command += [f"-I{native.SOURCES}", *map(str, sources), "-o", str(library)]
-    subprocess.run(command, check=True)
-    return library
-
-
 def counting(folder: Path) -> Path:
     """The kernels with lanes that count."""
     for path in native.SOURCES.iterdir():
@@ -80,7 +68,9 @@ def counting(folder: Path) -> Path:
     for name in KERNELS:
         with (folder / f"{name}.cc").open("a") as file:
             file.write(COUNTER.format(name))
-    return built(folder, sorted(folder.glob("*.cc")), "counting.so")
+    library = folder / "counting.so"
+    native.build(folder.glob("*.cc"), library)
+    return library
 
 
 def step(start: states.Start) -> stepping.Job:
@@ -137,7 +127,7 @@ def count(tasks: list[str]) -> dict[str, dict[str, float]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("task", nargs="*", default=["push"], help="(push)")
-    parser.add_argument("--rounds", type=int, default=200)
+    parser.add_argument("--rounds", type=int, default=40)
     parser.add_argument("--count", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.count:
@@ -148,7 +138,9 @@ def main() -> None:
     told = subprocess.run(command, check=True, capture_output=True, text=True)
     counted = json.loads(told.stdout.splitlines()[-1])
     with tempfile.TemporaryDirectory() as folder:
-        library = ctypes.CDLL(str(built(Path(folder), [HERE / "peak.cc"], "peak.so")))
+        path = Path(folder) / "peak.so"
+        native.build([HERE / "peak.cc"], path)
+        library = ctypes.CDLL(str(path))
     library.peak_operations.restype = library.copied_bytes.restype = ctypes.c_double
     library.copied_bytes.argtypes = [ctypes.c_int64]
     peak = statistics.median(library.peak_operations() for _ in range(3))
@@ -159,22 +151,14 @@ def main() -> None:
         size = sum(moved(step(start)).values())
         operations = sum(counted[task].values())
         whole = states.job(start, states.with_compliance(start)()[1])
-        took = _seconds(stepping.ours(whole), options.rounds) / whole.count
+        ours = {"ours": stepping.ours(whole)}
+        took = 1.0 / stepping.rates(ours, whole.count, options.rounds)["ours"]
         summing = operations / peak
         copying = size / library.copied_bytes(int(size * COUNT))
         cells = [f"{counted[task][name] / 1e3:.1f} k" for name in KERNELS]
         cells += [f"{size / 1e3:.1f} k"]
         cells += [f"{1e6 * x:.2f} us" for x in (summing, copying, took)]
         print(f"| {' | '.join([task, *cells, f'{took / (summing + copying):.0f}'])} |")
-
-
-def _seconds(run: Callable[[], Any], rounds: int) -> float:
-    times = []
-    for _ in range(rounds):
-        began = time.perf_counter()
-        run()
-        times.append(time.perf_counter() - began)
-    return statistics.median(times)
 
 
 if __name__ == "__main__":

@@ -30,9 +30,6 @@ inline I compared(F f) {
   return out;
 }
 
-inline float at(const V& a, int l) { return a[l]; }
-inline float at(float a, int) { return a; }
-
 #define COUNTED(op, call, out)                                                         \
   inline out operator op(const V& a, const V& b) {                                     \
     return call([&](int l) { return a[l] op b[l]; });                                  \

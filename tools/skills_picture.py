@@ -20,7 +20,7 @@ MOMENTS = {
     "hand-in-hand": (2, 2),
     "ball": (1, 0),
     "chicken-fight": (1, 3),
-    "sustained-push": (2, 2),
+    "sustained-push": (2, 0),
     "locomotion": (1, 2),
 }
 """Row and column in the strip of each skill, chosen by eye."""

@@ -19,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 
@@ -92,17 +93,27 @@ def _made() -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder) as work:
             made = Path(work) / "kernels.so"
-            files = map(str, sorted(SOURCES.glob("*.cc")))
-            include = f"-I{jax.ffi.include_dir()}"
-            subprocess.run(
-                [*command, include, *files, "-o", str(made)],
-                check=True,
-                capture_output=True,
-                text=True,
-                timeout=300,
-            )
+            build(SOURCES.glob("*.cc"), made)
             made.replace(library)
     return library
+
+
+def build(sources: Iterable[Path], library: Path) -> None:
+    """Compiles C++ files into a shared library, as the kernels are.
+
+    Raises:
+        OSError: no compiler.
+        subprocess.CalledProcessError: it failed; `stderr` says why.
+    """
+    include = f"-I{jax.ffi.include_dir()}", f"-I{SOURCES}"
+    files = map(str, sorted(sources))
+    subprocess.run(
+        [*_compiler(), *FLAGS, *include, *files, "-o", str(library)],
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
 
 
 def _compiler() -> list[str]:
