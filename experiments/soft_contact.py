@@ -1,12 +1,15 @@
-"""What compliance does to the force of a grip that pulls, and of a hug that closes.
+"""What compliance does to the force of a grip that pulls, of a hug that closes, and of
+an obstacle that presses.
 
 A spring takes hold of the left hand, or two of the upper arms, and its other end moves
-away within half a second. The character stands or walks as its policy has learned to,
-and nothing else disturbs it. Three arms meet the same episodes: alpha 0, alpha, and the
-control arm, in which the policy observes alpha and nothing is displaced.
+away within half a second. Or one at the chest moves on for a second at 0.5 m/s. The
+character stands or walks as its policy has learned to, and nothing else disturbs it.
+Three arms meet the same episodes: alpha 0, alpha, and the control arm, in which the
+policy observes alpha and nothing is displaced.
 
     python experiments/soft_contact.py sustained-push
     python experiments/soft_contact.py RUN_DIR --alpha 0.5 0.8 --episodes 384
+    python experiments/soft_contact.py sustained-push --press
 
 It prints the largest force of an episode and how the mean over episodes changes, as a
 share of the mean at alpha 0: with u, with u off, and by u alone.
@@ -35,15 +38,15 @@ import paired
 from dcc_jax import physics, quat
 from dcc_jax.character import BODIES, CONTROL_DT
 from dcc_jax.env import features
+from dcc_jax.motion.paths import Gaits
 from dcc_jax.motion.reference import RefState
 from dcc_jax.play.pull import Hands, Pulled, no_hands
 from dcc_jax.play.runs import find_run
 
 Array = jax.Array
 
-BEGIN, CLOSING, SECONDS = 2.0, 0.5, 6.0  # s
-DAMPING = 0.1  # s, of a spring, times its stiffness
-AWAY, INWARD = 0.4, 0.12  # m
+BEGIN, SECONDS = 2.0, 6.0  # s
+INWARD = 0.12  # m
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,9 @@ class Spring:
     bodies: tuple[str, str]
     stiffness: tuple[float, float]  # N/m
     inward: bool = False  # the ends close sideways; else they go off over the ground
+    away: float = 0.4  # m, how far they go off
+    closing: float = 0.5  # s, for which the ends move
+    damping: float = 0.1  # s, times the stiffness
 
 
 HANDS, ARMS = ("left_hand", "right_hand"), ("left_upper_arm", "right_upper_arm")
@@ -62,6 +68,12 @@ SPRINGS = (
     Spring("pull, 250 N/m", HANDS, (250.0, 0.0)),
     Spring("hug, 500 N/m", ARMS, (500.0, 500.0), inward=True),
 )
+CHEST = ("chest", "right_hand")
+OBSTACLES = tuple(
+    Spring(f"press, {k:g} N/m", CHEST, (k, 0.0), away=0.5, closing=1.0, damping=0.02)
+    for k in (300.0, 1000.0, 3000.0)
+)
+"""A slow one that does not stop: 0.5 m/s for a second."""
 
 
 @flax.struct.dataclass
@@ -71,15 +83,16 @@ class HeldState:
     task: Any
     hands: Hands
     time: Array  # [] s since the reset
-    spring: Array  # [] int32, index into SPRINGS
+    spring: Array  # [] int32, index into the springs
     anchor_w: Array  # [2, 3] m, where the bodies were when the springs took hold
     way_w: Array  # [2, 3] m, how far the other ends move
 
 
 @dataclass(frozen=True)
 class Held(Pulled):
-    """A task whose character is taken hold of by one of `SPRINGS`, drawn by episode."""
+    """A task whose character is held by one of some springs, drawn by episode."""
 
+    springs: tuple[Spring, ...] = SPRINGS
     name: ClassVar[str] = "held"
 
     def reset(
@@ -88,12 +101,13 @@ class Held(Pulled):
         """The task's own; nothing is held yet."""
         task_key, which_key, way_key = jax.random.split(key, 3)
         task, qpos, qvel = self.task.reset(task_key, scene, reference)
-        spring = jax.random.randint(which_key, (), 0, len(SPRINGS))
-        ids = jnp.array([[scene.body(name) for name in s.bodies] for s in SPRINGS])
+        spring = jax.random.randint(which_key, (), 0, len(self.springs))
+        ids = jnp.array([[scene.body(b) for b in s.bodies] for s in self.springs])
         hands = jax.tree.map(jnp.asarray, no_hands())
         hands = dataclasses.replace(hands, body=ids[spring])
         angle = jax.random.uniform(way_key, minval=-jnp.pi, maxval=jnp.pi)
-        way = AWAY * jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros(())])
+        away = jnp.array([s.away for s in self.springs])[spring]
+        way = away * jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros(())])
         nowhere = jnp.zeros((2, 3))
         state = HeldState(
             task=task,
@@ -112,21 +126,22 @@ class Held(Pulled):
         task, body = self.task.control_step(key, scene, state.task, body)
         time, before = state.time + CONTROL_DT, state.time < BEGIN
         here_w, closing_w = self._here(scene, state, body)
-        inward = jnp.array([spring.inward for spring in SPRINGS])[state.spring]
+        of_springs = [(s.inward, s.closing, s.damping) for s in self.springs]
+        inward, closing, damping = jnp.array(of_springs)[state.spring]
         anchor_w: Array = jax.lax.select(
             jnp.broadcast_to(before, (2, 3)), here_w, state.anchor_w
         )
         way_w: Array = jax.lax.select(
-            jnp.broadcast_to(before & inward, (2, 3)), closing_w, state.way_w
+            jnp.broadcast_to(before & (inward > 0), (2, 3)), closing_w, state.way_w
         )
-        share = jnp.clip((time - BEGIN) / CLOSING, 0.0, 1.0)
-        k = jnp.array([spring.stiffness for spring in SPRINGS])[state.spring]
+        share = jnp.clip((time - BEGIN) / closing, 0.0, 1.0)
+        k = jnp.array([s.stiffness for s in self.springs])[state.spring]
         k = jnp.where(time < BEGIN, 0.0, k)
         hands = dataclasses.replace(
             state.hands,
             target_w=anchor_w + share * way_w,
             stiffness=k,
-            damping=DAMPING * k,
+            damping=damping * k,
         )
         return HeldState(task, hands, time, state.spring, anchor_w, way_w), body
 
@@ -136,7 +151,7 @@ class Held(Pulled):
         """Where the bodies are [2, 3], and the way inwards from there [2, 3], m."""
         q = scene.character_qpos(body.qpos)
         pos_w, _ = features.body_poses(features.skeleton(), q)
-        rows = [[BODIES.index(name) for name in s.bodies] for s in SPRINGS]
+        rows = [[BODIES.index(name) for name in s.bodies] for s in self.springs]
         _, heading = features.local_frame(q)
         inward = INWARD * jnp.array([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
         return pos_w[jnp.array(rows)[state.spring]], quat.rotate(heading, inward)
@@ -149,10 +164,10 @@ class Held(Pulled):
         return own | {"spring": state.spring.astype(jnp.float32)}
 
 
-def lines(rows: list[paired.Row]) -> Iterator[str]:
+def lines(rows: list[paired.Row], springs: tuple[Spring, ...]) -> Iterator[str]:
     """Markdown, a row of each spring and level above 0."""
     rigid, *arms = paired.arms_of(rows)
-    for i, spring in enumerate(SPRINGS):
+    for i, spring in enumerate(springs):
         here = [row for row in rows if row["task/spring/final"] == i]
         for on in (arm for arm in arms if arm["u_on"]):
             off = on | {"u_on": False}
@@ -174,22 +189,27 @@ def main() -> None:
     add("run", type=Path, metavar="RUN_DIR|NAME")
     add("--alpha", type=float, nargs="+", default=[0.5, 0.8], metavar="A")
     add("--episodes", type=int, default=384, help="of each arm, all springs (384)")
+    add("--press", action="store_true", help="obstacles press; it is told to stand")
     add("--seed", type=int, default=0)
     options = parser.parse_args()
+    springs = OBSTACLES if options.press else SPRINGS
+    task = find_run(options.run).config.task.quiet()
+    if options.press:
+        task = dataclasses.replace(task, gaits=Gaits(speeds=(0.0,)))
     report = dcc_jax.evaluate(
         options.run,
         episodes=options.episodes,
         alpha=[0.0, *options.alpha],
         seconds=SECONDS,
         seed=options.seed,
-        task=Held(find_run(options.run).config.task.quiet()),
+        task=Held(task, springs),
     )
     print(
         "| spring | alpha | peak, alpha 0 | with u | u off | u alone | falls: 0 ",
         end="",
     )
     print("| u off | with u |\n|---|--:|--:|--:|--:|--:|--:|--:|--:|")
-    print("\n".join(lines(report.rows)))
+    print("\n".join(lines(report.rows, springs)))
 
 
 if __name__ == "__main__":

@@ -197,8 +197,7 @@ def test_table_of_soft_contacts_has_the_effect_of_u_alone():
     soft = importlib.import_module("soft_contact")
     rows = _rows(**{"force/max": (100.0, 60.0, 90.0), "fell": (0.0, 0.0, 0.0)})
     rows = [row | {"task/spring/final": 0.0, "fell": False} for row in rows]
-    soft.SPRINGS = soft.SPRINGS[:1]
-    (line,) = soft.lines(rows)
+    (line,) = soft.lines(rows, soft.SPRINGS[:1])
     cells = [cell.split(" [")[0].strip() for cell in line.strip("|").split("|")]
     expected = [
         "pull, 5 N/m",
