@@ -21,6 +21,8 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import flax.struct
 import jax
@@ -96,6 +98,93 @@ def _batch_last(function: Callable) -> Callable:
     return one
 
 
+class _System(NamedTuple):
+    """H d = -gradient of a Newton iteration."""
+
+    H: arrowhead.Fronts
+    gradient: arrowhead.Split
+    gauss: arrowhead.Split  # M a - smooth, the gradient without the constraints'
+
+
+class _Iterate(NamedTuple):
+    """Carried from iteration to iteration, with the linear system of the next: computed
+    once, where XLA would compute parts of it again wherever the factorization needs
+    them."""
+
+    made: Array  # [] iterations
+    done: Array  # [B] converged
+    qacc: arrowhead.Split
+    residual: Array  # [R, B] J a - aref
+    mass_qacc: arrowhead.Split  # M a
+    system: _System
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """What stays the same in all iterations; rows in the arrow's order."""
+
+    shape: Arrow
+    M: arrowhead.Fronts
+    smooth: arrowhead.Split
+    J: arrowhead.Split
+    D: Array  # [R, B]
+    always: Array  # [R, 1] of an equality
+
+    def active(self, residual: Array) -> Array:
+        return self.always | (residual < 0)
+
+    def weights(self, residual: Array) -> Array:
+        return jnp.where(self.active(residual), self.D, 0.0)
+
+    def system(self, residual: Array, mass_qacc: arrowhead.Split) -> _System:
+        gauss = jax.tree.map(jnp.subtract, mass_qacc, self.smooth)
+        weight = self.weights(residual)
+        H, gradient = arrowhead.assembled(
+            self.shape, self.M, gauss, self.J, weight, residual
+        )
+        return _System(H, gradient, gauss)
+
+    def started(self, qacc: arrowhead.Split, aref: Array) -> _Iterate:
+        residual = arrowhead.rows_times(self.shape, self.J, qacc) - aref
+        mass_qacc = arrowhead.times(self.shape, self.M, qacc)
+        return _Iterate(
+            made=jnp.zeros((), jnp.int32),
+            done=jnp.zeros(residual.shape[-1], bool),
+            qacc=qacc,
+            residual=residual,
+            mass_qacc=mass_qacc,
+            system=self.system(residual, mass_qacc),
+        )
+
+    def iterated(self, at: _Iterate) -> _Iterate:
+        shape, system = self.shape, at.system
+        downhill = jax.tree.map(lambda g: -g[..., None, :], system.gradient)
+        search = arrowhead.solve(shape, system.H, downhill)
+        search = jax.tree.map(lambda x: x[..., 0, :], search)
+        slope = arrowhead.rows_times(shape, self.J, search)
+        mass_search = arrowhead.times(shape, self.M, search)
+        step = _line_search(
+            self.weights,
+            at.residual,
+            slope,
+            arrowhead.dot(search, system.gauss),
+            arrowhead.dot(search, mass_search),
+        )
+        step = jnp.where(at.done, 0.0, step)
+        residual = at.residual + step * slope
+        same = jnp.all(self.active(residual) == self.active(at.residual), axis=0)
+        mass_qacc = jax.tree.map(lambda a, d: a + step * d, at.mass_qacc, mass_search)
+        return _Iterate(
+            made=at.made + 1,
+            # Written so that what is not a number is done as well.
+            done=at.done | (same & ~(jnp.abs(step - 1.0) > FULL_STEP)),
+            qacc=jax.tree.map(lambda a, d: a + step * d, at.qacc, search),
+            residual=residual,
+            mass_qacc=mass_qacc,
+            system=self.system(residual, mass_qacc),
+        )
+
+
 def _newton(
     shape: Arrow,
     num_equality: int,
@@ -108,69 +197,23 @@ def _newton(
     start: Array,
 ) -> tuple[Array, Array]:
     order = arrowhead.row_order(shape)
-    J_parts = arrowhead.row_parts(shape, J)
-    D, aref = arrowhead.take(D, order), arrowhead.take(aref, order)
-    always = jnp.asarray(order < num_equality)[:, None]
-    M = arrowhead.fronts(shape, mass)
-    smooth_parts = arrowhead.split(shape, smooth)
-
-    def active(residual: Array) -> Array:
-        return always | (residual < 0)
-
-    def weights(residual: Array) -> Array:
-        return jnp.where(active(residual), D, 0.0)
-
-    def system(
-        residual: Array, mass_qacc: arrowhead.Split
-    ) -> tuple[arrowhead.Fronts, arrowhead.Split, arrowhead.Split]:
-        gauss = jax.tree.map(jnp.subtract, mass_qacc, smooth_parts)
-        weight = weights(residual)
-        return *arrowhead.assembled(shape, M, gauss, J_parts, weight, residual), gauss
-
-    def unfinished(carry: tuple) -> Array:
-        count, done, *_ = carry
-        return (count < iterations) & ~jnp.all(done)
-
-    # The linear system is carried from one iteration into the next, and so computed
-    # once: XLA would compute parts of it again wherever the factorization needs them.
-    def iterated(carry: tuple) -> tuple:
-        count, done, qacc, residual, mass_qacc, (H, gradient, gauss) = carry
-        downhill = jax.tree.map(lambda g: -g[..., None, :], gradient)
-        search = arrowhead.solve(shape, H, downhill)
-        search = jax.tree.map(lambda x: x[..., 0, :], search)
-        slope = arrowhead.rows_times(shape, J_parts, search)
-        mass_search = arrowhead.times(shape, M, search)
-        step = _line_search(
-            weights,
-            residual,
-            slope,
-            arrowhead.dot(search, gauss),
-            arrowhead.dot(search, mass_search),
-        )
-        step = jnp.where(done, 0.0, step)
-        moved = residual + step * slope
-        same = jnp.all(active(moved) == active(residual), axis=0)
-        # Written so that what is not a number is done as well.
-        done = done | (same & ~(jnp.abs(step - 1.0) > FULL_STEP))
-        qacc = jax.tree.map(lambda a, d: a + step * d, qacc, search)
-        mass_qacc = jax.tree.map(lambda a, d: a + step * d, mass_qacc, mass_search)
-        return count + 1, done, qacc, moved, mass_qacc, system(moved, mass_qacc)
-
-    qacc = arrowhead.split(shape, start)
-    residual = arrowhead.rows_times(shape, J_parts, qacc) - aref
-    mass_qacc = arrowhead.times(shape, M, qacc)
-    carry = (
-        jnp.zeros((), jnp.int32),
-        jnp.zeros(residual.shape[-1], bool),
-        qacc,
-        residual,
-        mass_qacc,
-        system(residual, mass_qacc),
+    problem = _Problem(
+        shape=shape,
+        M=arrowhead.fronts(shape, mass),
+        smooth=arrowhead.split(shape, smooth),
+        J=arrowhead.row_parts(shape, J),
+        D=arrowhead.take(D, order),
+        always=jnp.asarray(order < num_equality)[:, None],
     )
-    _, _, qacc, residual, *_ = jax.lax.while_loop(unfinished, iterated, carry)
-    force = -weights(residual) * residual
+
+    def unfinished(at: _Iterate) -> Array:
+        return (at.made < iterations) & ~jnp.all(at.done)
+
+    first = problem.started(arrowhead.split(shape, start), arrowhead.take(aref, order))
+    last = jax.lax.while_loop(unfinished, problem.iterated, first)
+    force = -problem.weights(last.residual) * last.residual
     in_order = force[arrowhead.places(order, shape.num_rows)]
-    return arrowhead.joined(shape, qacc), in_order
+    return arrowhead.joined(shape, last.qacc), in_order
 
 
 def _solve_mass(shape: Arrow, less: np.ndarray, mass: Array, forces: Array) -> Array:
