@@ -60,6 +60,7 @@ class Spring:
     away: float = 0.4  # m, how far they go off
     closing: float = 0.5  # s, for which the ends move
     damping: float = 0.1  # s, times the stiffness
+    lasting: float = SECONDS  # s, after which it lets go
 
 
 HANDS, ARMS = ("left_hand", "right_hand"), ("left_upper_arm", "right_upper_arm")
@@ -70,10 +71,18 @@ SPRINGS = (
 )
 CHEST = ("chest", "right_hand")
 OBSTACLES = tuple(
-    Spring(f"press, {k:g} N/m", CHEST, (k, 0.0), away=0.5, closing=1.0, damping=0.02)
+    Spring(
+        f"press, {k:g} N/m",
+        CHEST,
+        (k, 0.0),
+        away=0.5,
+        closing=1.0,
+        damping=0.02,
+        lasting=1.0,
+    )
     for k in (300.0, 1000.0, 3000.0)
 )
-"""A slow one that does not stop: 0.5 m/s for a second."""
+"""A slow one that does not stop: 0.5 m/s for a second, then it is gone."""
 
 
 @flax.struct.dataclass
@@ -126,8 +135,8 @@ class Held(Pulled):
         task, body = self.task.control_step(key, scene, state.task, body)
         time, before = state.time + CONTROL_DT, state.time < BEGIN
         here_w, closing_w = self._here(scene, state, body)
-        of_springs = [(s.inward, s.closing, s.damping) for s in self.springs]
-        inward, closing, damping = jnp.array(of_springs)[state.spring]
+        of_springs = [(s.inward, s.closing, s.damping, s.lasting) for s in self.springs]
+        inward, closing, damping, lasting = jnp.array(of_springs)[state.spring]
         anchor_w: Array = jax.lax.select(
             jnp.broadcast_to(before, (2, 3)), here_w, state.anchor_w
         )
@@ -136,7 +145,7 @@ class Held(Pulled):
         )
         share = jnp.clip((time - BEGIN) / closing, 0.0, 1.0)
         k = jnp.array([s.stiffness for s in self.springs])[state.spring]
-        k = jnp.where(time < BEGIN, 0.0, k)
+        k = jnp.where((time < BEGIN) | (time > BEGIN + lasting), 0.0, k)
         hands = dataclasses.replace(
             state.hands,
             target_w=anchor_w + share * way_w,
