@@ -32,6 +32,8 @@ LEVERS: dict[str, dict[str, Any]] = {
     "floor 0.01": {"disc.feature_floor": 0.01},
     "exploration 3 degrees": NARROW,
     "exploration 3 degrees, penalty 10, no noise": {**NARROW, **OPEN},
+    "pairs 3 steps apart": {"disc.span": 3},
+    "pairs 10 steps apart": {"disc.span": 10},
     "4 minibatches": {"disc.minibatches": 4},
     "learning rate 3e-5": {"disc.learning_rate": 3e-5},
     "beta 0.25": {"env.reward.beta": 0.25},

@@ -24,7 +24,7 @@ def reference() -> style.Reference:
 
 
 def _clip_pairs(seed: int, count: int) -> jax.Array:
-    s, s_next, _ = Toy().expert_pairs(jax.random.key(seed), count)
+    s, s_next, _ = Toy().expert_pairs(jax.random.key(seed), jnp.ones(count, jnp.int32))
     return Toy().style_coordinates(s, s_next)
 
 

@@ -214,9 +214,10 @@ class Environment:
         )
         return terminate_on_nonfinite(self._judged(self.observed(new)), state)
 
-    def expert_pairs(self, key: Array, n: int) -> tuple[Array, Array, Array]:
-        """(s, s') ~ M: features [n, 270] twice, and the condition [n, C]."""
-        s, s_next, phase = expert.pairs(self.kinematics, self.references, key, n)
+    def expert_pairs(self, key: Array, spans: Array) -> tuple[Array, Array, Array]:
+        """(s, s') ~ M, `spans` [n] control steps apart: features [n, 270] twice, and the
+        condition [n, C]."""
+        s, s_next, phase = expert.pairs(self.kinematics, self.references, key, spans)
         condition = jax.vmap(observation.of_phase)(phase)
         return s, s_next, condition[:, : self.condition_size]
 

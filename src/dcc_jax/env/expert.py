@@ -19,13 +19,13 @@ Array = jax.Array
 
 
 def pairs(
-    kinematics: Kinematics, references: References, key: Array, n: int
+    kinematics: Kinematics, references: References, key: Array, spans: Array
 ) -> tuple[Array, Array, Array]:
-    """(s, s') ~ M: the features [n, 270] of clips, now and a control step later, and
-    the clip's phase [n] then."""
-    windows, phase = references.sample_windows(key, n)
+    """(s, s') ~ M: the features [n, 270] of clips, now and `spans` [n] control steps
+    later, and the clip's phase [n] then."""
+    windows, phase = references.sample_windows(key, spans)
     pair = jax.vmap(lambda q, before: features.body_features(kinematics, q, before))
-    s, s_next = pair(windows[:, 1], windows[:, 0]), pair(windows[:, 2], windows[:, 1])
+    s, s_next = pair(windows[:, 1], windows[:, 0]), pair(windows[:, 3], windows[:, 2])
     return s, s_next, phase
 
 
