@@ -1,4 +1,4 @@
-"""Pairs (s, s') of body features as points in space, for distances between motions."""
+"""What the discriminator sees of a state, and pairs of it as points in space."""
 
 from __future__ import annotations
 
@@ -14,8 +14,30 @@ COLUMN_ARM = 0.1  # m; a body turned by 1 rad is about 0.14 m away
 VELOCITY_TIME = 0.1  # s; a body faster by 1 m/s is 0.1 m away
 
 
-def pair_coordinates(s: Array, s_next: Array, dt: float) -> Array:
-    """A pair of `body_features` as a point [..., 225] in m; Euclidean distances count.
+def in_motion(bodies: Array, dt: float) -> Array:
+    """`body_features` [..., 270] with the past as a change until now, the same size.
+
+    A body contributes its position (m), its velocity times `VELOCITY_TIME` (m), its
+    two columns, and their rate times `VELOCITY_TIME`.
+
+    Departure: the paper has positions and columns now and then (Sec. 4.2). The same
+    is in both, but there a velocity is a small difference of two large numbers, each
+    divided by the spread of positions: a discriminator that is smooth, or that has
+    noise on what it sees, does not see it.
+
+    Args:
+        bodies: [..., 270].
+        dt: control step, s.
+    """
+    parts = bodies.reshape(*bodies.shape[:-1], -1, BODY_FEATURE_SIZE)
+    pos, then, columns, columns_then = jnp.split(parts, [3, 6, 12], axis=-1)
+    per = VELOCITY_TIME / dt
+    moving = [pos, per * (pos - then), columns, per * (columns - columns_then)]
+    return jnp.concatenate(moving, axis=-1).reshape(bodies.shape)
+
+
+def pair_coordinates(s: Array, s_next: Array) -> Array:
+    """A pair of `in_motion` as a point [..., 225] in m; Euclidean distances count.
 
     A body contributes its position, its two columns times `COLUMN_ARM`, and its
     velocity in s' and in s times `VELOCITY_TIME`. All is divided by the root of the
@@ -24,15 +46,14 @@ def pair_coordinates(s: Array, s_next: Array, dt: float) -> Array:
     Args:
         s: [..., 270].
         s_next: [..., 270], a control step later.
-        dt: control step, s.
     """
     before = s.reshape(*s.shape[:-1], -1, BODY_FEATURE_SIZE)
     now = s_next.reshape(*s_next.shape[:-1], -1, BODY_FEATURE_SIZE)
     parts = [
         now[..., 0:3],
         COLUMN_ARM * now[..., 6:12],
-        VELOCITY_TIME / dt * (now[..., 0:3] - now[..., 3:6]),
-        VELOCITY_TIME / dt * (before[..., 0:3] - before[..., 3:6]),
+        now[..., 3:6],
+        before[..., 3:6],
     ]
     points = jnp.concatenate(parts, axis=-1) / np.sqrt(now.shape[-2])
     return points.reshape(*points.shape[:-2], -1)

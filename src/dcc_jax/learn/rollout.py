@@ -57,7 +57,7 @@ class Running:
 
     @property
     def remembered(self) -> Array:
-        """Features of the last K control steps, or the reset's in their place [B, K, F]."""
+        """Features [B, K, F] of the last K control steps, or the reset's."""
         return jnp.concatenate([self.earlier, self.env.features[:, None]], axis=1)
 
 

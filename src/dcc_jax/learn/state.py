@@ -172,9 +172,7 @@ def init_state(
         policy = dataclasses.replace(agent.policy, params=start.params)
         agent = dataclasses.replace(agent, policy=policy)
         obs_normalizer = start.normalizer
-    s, _, _ = environment.expert_pairs(
-        expert_key, jnp.ones(_EXPERT_SAMPLE, jnp.int32)
-    )
+    s, _, _ = environment.expert_pairs(expert_key, jnp.ones(_EXPERT_SAMPLE, jnp.int32))
     width = 2 * environment.feature_size + environment.condition_size
     disc = networks.init_mlp(disc_key, (width, *config.disc.hidden, 1))
     return TrainState(

@@ -103,9 +103,7 @@ def of_running(environment: Posed, running: Running) -> dict[str, Array]:
 
 def floor(environment: Posed, reference: Reference, count: int = 512) -> Array:
     """`style/nearest` [] in m of other pairs of the clips: nothing comes nearer."""
-    s, s_next, _ = environment.expert_pairs(
-        jax.random.key(_SEED + 1), _next(count)
-    )
+    s, s_next, _ = environment.expert_pairs(jax.random.key(_SEED + 1), _next(count))
     return jnp.mean(nearest(reference, environment.style_coordinates(s, s_next)))
 
 
