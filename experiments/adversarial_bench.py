@@ -34,6 +34,7 @@ LEVERS: dict[str, dict[str, Any]] = {
     "exploration 3 degrees, penalty 10, no noise": {**NARROW, **OPEN},
     "pairs 3 steps apart": {"disc.span": 3},
     "pairs 10 steps apart": {"disc.span": 10},
+    "velocities count three times": {"env.velocity_time": 0.1},
     "4 minibatches": {"disc.minibatches": 4},
     "learning rate 3e-5": {"disc.learning_rate": 3e-5},
     "beta 0.25": {"env.reward.beta": 0.25},

@@ -15,6 +15,7 @@ from dcc_jax.learn import style
 from toy import Toy
 
 DT = 1.0 / 30.0
+TIME = 0.05  # s, as velocities count
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +90,7 @@ def _features(position: np.ndarray, before: np.ndarray, columns: np.ndarray):
     """[270] of bodies at positions [15, 3] now and then, one turn for all [6]."""
     turn = np.broadcast_to(columns, (15, 6))
     bodies = np.concatenate([position, before, turn, turn], 1).ravel()
-    return in_motion(jnp.array(bodies), DT)
+    return in_motion(jnp.array(bodies), TIME)
 
 
 def test_pair_moved_as_a_whole_is_as_far_away():
@@ -98,7 +99,7 @@ def test_pair_moved_as_a_whole_is_as_far_away():
     here = _features(at, at, turn)
     moved = at + np.array([0.0, 0.03, 0.04])
     aside = _features(moved, moved, turn)
-    gap = pair_coordinates(here, here) - pair_coordinates(aside, aside)
+    gap = pair_coordinates(here, here, TIME) - pair_coordinates(aside, aside, TIME)
     assert gap.shape == (225,)
     assert float(jnp.linalg.norm(gap)) == pytest.approx(0.05, rel=1e-4)
 
@@ -108,22 +109,22 @@ def test_speed_and_turn_count_as_the_constants_say():
     rest = _features(at, at, turn)
     moving = _features(at, at - [DT, 0.0, 0.0], turn)  # 1 m/s
     turned = _features(at, at, np.eye(6)[0])
-    standing = pair_coordinates(rest, rest)
+    standing = pair_coordinates(rest, rest, TIME)
     for pair, expected in (
         ((rest, moving), VELOCITY_TIME),
         ((moving, rest), VELOCITY_TIME),
         ((rest, turned), COLUMN_ARM),
     ):
-        gap = pair_coordinates(*pair) - standing
+        gap = pair_coordinates(*pair, TIME) - standing
         assert float(jnp.linalg.norm(gap)) == pytest.approx(expected, rel=1e-4)
 
 
 def test_the_past_is_seen_as_a_change_and_nothing_is_lost():
     rng = np.random.default_rng(2)
     parts = rng.normal(size=(4, 15, 18)).astype(np.float32)
-    seen = np.asarray(in_motion(jnp.array(parts.reshape(4, 270)), DT))
+    seen = np.asarray(in_motion(jnp.array(parts.reshape(4, 270)), TIME))
     pos, velocity, columns, rate = np.split(seen.reshape(4, 15, 18), [3, 6, 12], axis=2)
-    per = VELOCITY_TIME / DT
+    per = TIME / DT
     back = [pos, pos - velocity / per, columns, columns - rate / per]
     np.testing.assert_allclose(np.concatenate(back, 2), parts, atol=1e-5)
 

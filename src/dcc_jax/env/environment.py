@@ -217,7 +217,9 @@ class Environment:
     def expert_pairs(self, key: Array, spans: Array) -> tuple[Array, Array, Array]:
         """(s, s') ~ M, `spans` [n] control steps apart: features [n, 270] twice, and
         the condition [n, C]."""
-        s, s_next, phase = expert.pairs(self.kinematics, self.references, key, spans)
+        s, s_next, phase = expert.pairs(
+            self.kinematics, self.references, key, spans, self.config.velocity_time
+        )
         condition = jax.vmap(observation.of_phase)(phase)
         return s, s_next, condition[:, : self.condition_size]
 
@@ -232,7 +234,7 @@ class Environment:
 
     def style_coordinates(self, s: Array, s_next: Array) -> Array:
         """Pairs of features [..., 270] as points [..., 225] in m (`learn.style`)."""
-        return pairs.pair_coordinates(s, s_next)
+        return pairs.pair_coordinates(s, s_next, self.config.velocity_time)
 
     def _drawn(self, key: Array, place_key: Array) -> tuple[RefState, RefState]:
         """The moment of the reference an episode begins at, and the start beside it."""
@@ -289,7 +291,7 @@ class Environment:
             compliance.whole_yield(self.controller, state.displacement),
             state.yield_previous,
         )
-        seen = pairs.in_motion(bodies, CONTROL_DT)
+        seen = pairs.in_motion(bodies, self.config.velocity_time)
         first = state.time == 0.0
         return dataclasses.replace(
             state,

@@ -20,7 +20,11 @@ Array = jax.Array
 
 
 def pairs(
-    kinematics: Kinematics, references: References, key: Array, spans: Array
+    kinematics: Kinematics,
+    references: References,
+    key: Array,
+    spans: Array,
+    velocity_time: float,
 ) -> tuple[Array, Array, Array]:
     """(s, s') ~ M: the features [n, 270] of clips, now and `spans` [n] control steps
     later, and the clip's phase [n] then."""
@@ -28,7 +32,7 @@ def pairs(
 
     def seen(q: Array, before: Array) -> Array:
         bodies = features.body_features(kinematics, q, before)
-        return in_motion(bodies, references.control_dt)
+        return in_motion(bodies, velocity_time)
 
     pair = jax.vmap(seen)
     s, s_next = pair(windows[:, 1], windows[:, 0]), pair(windows[:, 3], windows[:, 2])
