@@ -71,9 +71,9 @@ class Toy:
         nan = position[0] * 1000.0 % 1.0 < 0.1
         return after.replace(nan=nan, terminated=after.terminated | nan)
 
-    def expert_pairs(self, key: Array, n: int) -> tuple[Array, Array, Array]:
-        s = 0.2 * jax.random.normal(key, (n, 2))
-        return s, 0.7 * s, jnp.zeros((n, 0))
+    def expert_pairs(self, key: Array, spans: Array) -> tuple[Array, Array, Array]:
+        s = 0.2 * jax.random.normal(key, (len(spans), 2))
+        return s, 0.7 ** spans[:, None] * s, jnp.zeros((len(spans), 0))
 
     def expert_action(self, state: ToyState) -> Array:
         return -0.5 * state.features

@@ -66,8 +66,8 @@ def test_the_discriminator_is_given_the_phase_that_the_policy_observes(door):
 def test_the_clips_come_with_their_phase(door):
     """A pair that is late in the clip has its phase there: the pose tells the time."""
     environment, _ = door
-    s, s_next, condition = jax.jit(environment.expert_pairs, static_argnums=1)(
-        jax.random.key(0), 64
+    s, s_next, condition = jax.jit(environment.expert_pairs)(
+        jax.random.key(0), jnp.ones(64, jnp.int32)
     )
     assert condition.shape == (64, PHASE_SIZE)
     turn = np.hypot(condition[:, 1], condition[:, 2])

@@ -32,13 +32,13 @@ def taken() -> tuple[rollout.Actors, rollout.Rollout]:
     return _taken(chunk=4)
 
 
-def _taken(chunk: int | None) -> tuple[rollout.Actors, rollout.Rollout]:
+def _taken(chunk: int | None, span: int = 1) -> tuple[rollout.Actors, rollout.Rollout]:
     env = Toy(wall=1.5, horizon=7)
     actors = _actors(env)
     keys = jax.random.split(jax.random.key(1), ENVS)
 
     def run(key: jax.Array) -> rollout.Rollout:
-        running = rollout.reset_all(keys, env, None)
+        running = rollout.reset_all(keys, env, None, span)
         return rollout.rollout(key, env, actors, running, STEPS, CONFIG, chunk)
 
     return actors, jax.jit(run)(jax.random.key(2))
@@ -79,6 +79,25 @@ def test_pair_of_the_discriminator_never_straddles_a_reset(taken):
     # ... and s' where it ended, before the reset: beyond the wall where it fell.
     fell = np.asarray(transitions.pairs.s_next)[np.asarray(transitions.terminated)]
     assert (np.abs(fell).max(axis=1) > 1.5).all()
+
+
+@pytest.mark.parametrize("chunk", [4, None])
+def test_a_wider_pair_reaches_back_within_its_episode(taken, chunk):
+    near, wide = taken[1].transitions, _taken(chunk, span=4)[1].transitions
+    np.testing.assert_allclose(wide.obs, near.obs, atol=2e-5)
+    np.testing.assert_allclose(wide.pairs.s_next, near.pairs.s_next, atol=2e-5)
+    assert (np.asarray(near.span) == 1).all()
+    ends = np.asarray(wide.terminated | wide.truncated)
+    for b in range(ENVS):
+        age = 0
+        for t in range(STEPS):
+            age += 1
+            span = min(age, 4)
+            assert wide.span[t, b] == span
+            # What was observed before the first of the steps between.
+            began = wide.obs[t - span + 1, b, :2]
+            np.testing.assert_array_equal(wide.pairs.s[t, b], began)
+            age = 0 if ends[t, b] else age
 
 
 def test_length_counts_the_steps_of_the_episode(taken):

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from dcc_jax.env.pairs import COLUMN_ARM, VELOCITY_TIME, pair_coordinates
+from dcc_jax.env.pairs import COLUMN_ARM, VELOCITY_TIME, in_motion, pair_coordinates
 from dcc_jax.learn import style
 from toy import Toy
 
 DT = 1.0 / 30.0
+TIME = 0.05  # s, as velocities count
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +25,7 @@ def reference() -> style.Reference:
 
 
 def _clip_pairs(seed: int, count: int) -> jax.Array:
-    s, s_next, _ = Toy().expert_pairs(jax.random.key(seed), count)
+    s, s_next, _ = Toy().expert_pairs(jax.random.key(seed), jnp.ones(count, jnp.int32))
     return Toy().style_coordinates(s, s_next)
 
 
@@ -88,7 +89,8 @@ def test_environments_that_were_just_reset_do_not_count():
 def _features(position: np.ndarray, before: np.ndarray, columns: np.ndarray):
     """[270] of bodies at positions [15, 3] now and then, one turn for all [6]."""
     turn = np.broadcast_to(columns, (15, 6))
-    return jnp.array(np.concatenate([position, before, turn, turn], 1).ravel())
+    bodies = np.concatenate([position, before, turn, turn], 1).ravel()
+    return in_motion(jnp.array(bodies), TIME)
 
 
 def test_pair_moved_as_a_whole_is_as_far_away():
@@ -97,7 +99,7 @@ def test_pair_moved_as_a_whole_is_as_far_away():
     here = _features(at, at, turn)
     moved = at + np.array([0.0, 0.03, 0.04])
     aside = _features(moved, moved, turn)
-    gap = pair_coordinates(here, here, DT) - pair_coordinates(aside, aside, DT)
+    gap = pair_coordinates(here, here, TIME) - pair_coordinates(aside, aside, TIME)
     assert gap.shape == (225,)
     assert float(jnp.linalg.norm(gap)) == pytest.approx(0.05, rel=1e-4)
 
@@ -107,14 +109,24 @@ def test_speed_and_turn_count_as_the_constants_say():
     rest = _features(at, at, turn)
     moving = _features(at, at - [DT, 0.0, 0.0], turn)  # 1 m/s
     turned = _features(at, at, np.eye(6)[0])
-    standing = pair_coordinates(rest, rest, DT)
+    standing = pair_coordinates(rest, rest, TIME)
     for pair, expected in (
         ((rest, moving), VELOCITY_TIME),
         ((moving, rest), VELOCITY_TIME),
         ((rest, turned), COLUMN_ARM),
     ):
-        gap = pair_coordinates(*pair, DT) - standing
+        gap = pair_coordinates(*pair, TIME) - standing
         assert float(jnp.linalg.norm(gap)) == pytest.approx(expected, rel=1e-4)
+
+
+def test_the_past_is_seen_as_a_change_and_nothing_is_lost():
+    rng = np.random.default_rng(2)
+    parts = rng.normal(size=(4, 15, 18)).astype(np.float32)
+    seen = np.asarray(in_motion(jnp.array(parts.reshape(4, 270)), TIME))
+    pos, velocity, columns, rate = np.split(seen.reshape(4, 15, 18), [3, 6, 12], axis=2)
+    per = TIME / DT
+    back = [pos, pos - velocity / per, columns, columns - rate / per]
+    np.testing.assert_allclose(np.concatenate(back, 2), parts, atol=1e-5)
 
 
 def test_floor_is_the_distance_of_other_pairs_of_the_clips(reference):

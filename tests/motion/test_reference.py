@@ -17,7 +17,7 @@ DT = 1.0 / FPS
 
 qpos_at = jax.jit(lambda refs, clip, time: refs.qpos_at(clip, time))
 qvel_at = jax.jit(lambda refs, clip, time: refs.qvel_at(clip, time))
-WINDOWS = 2000
+SPANS = np.tile([1, 3], 2000 // 2)  # of the windows, in control steps
 
 
 def still(frames: int) -> np.ndarray:
@@ -82,7 +82,7 @@ def windows(refs):
     @jax.jit
     @chex.assert_max_traces(n=1)
     def draw(references, key):
-        return references.sample_windows(key, WINDOWS)[0]
+        return references.sample_windows(key, SPANS)[0]
 
     return [np.array(draw(refs, jax.random.key(seed))) for seed in (0, 1)]
 
@@ -190,10 +190,20 @@ def on_circle(poses: np.ndarray) -> np.ndarray:
 
 def test_windows_never_reach_past_an_end(windows):
     for poses in windows:
-        assert poses.shape == (WINDOWS, 3, 55)
+        assert poses.shape == (len(SPANS), 4, 55)
         # A window held at an end, or taken from two clips, would have another step.
-        steps = np.diff(poses[~on_circle(poses)][:, :, 0], axis=1)
-        np.testing.assert_allclose(steps, DT, atol=2e-5)
+        straight = ~on_circle(poses)
+        steps = np.diff(poses[straight][:, :, 0], axis=1) / DT
+        expected = np.stack([np.ones(len(SPANS)), SPANS - 1, np.ones(len(SPANS))], 1)
+        np.testing.assert_allclose(steps, expected[straight], atol=1e-3)
+
+
+def test_a_window_wider_than_its_clip_holds_the_last_pose(refs):
+    wide = np.asarray(refs.sample_windows(jax.random.key(1), np.full(200, 40))[0])
+    steps = np.diff(wide[~on_circle(wide)][:, :, 0], axis=1)
+    np.testing.assert_allclose(steps[:, 0], DT, atol=2e-5)
+    np.testing.assert_allclose(steps[:, 2], 0.0, atol=2e-5)
+    assert np.isfinite(wide).all()
 
 
 def test_clips_are_drawn_by_weight_and_anew_for_every_key(windows):

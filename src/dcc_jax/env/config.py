@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-from dcc_jax.character import CONTROL_RATE
+from dcc_jax.character import CONTROL_DT, CONTROL_RATE
 from dcc_jax.control.config import ComplianceConfig
 from dcc_jax.env.rewards import RewardConfig
 
@@ -63,6 +64,10 @@ class EnvConfig:
     distance to the reference's pose, of which actions are then offsets; or what the
     `task` says."""
 
+    velocity_time: float = CONTROL_DT
+    """s; 1 m/s counts as much as this many m in what the discriminator sees. A small
+    one hides how the feet slide, a large one lets it see the noise of exploration."""
+
     compliance: ComplianceConfig = field(default_factory=ComplianceConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
 
@@ -79,6 +84,10 @@ class EnvConfig:
                 raise ValueError(
                     f"env.alpha_max must be at least alpha, got {self.alpha_max}"
                 )
+        if not 0.0 < self.velocity_time < math.inf:
+            raise ValueError(
+                f"env.velocity_time must be positive, got {self.velocity_time}"
+            )
         if not self.episode_seconds > 0.1:
             raise ValueError(
                 f"env.episode_seconds must be more than 0.1, got {self.episode_seconds}"

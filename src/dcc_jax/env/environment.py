@@ -214,9 +214,12 @@ class Environment:
         )
         return terminate_on_nonfinite(self._judged(self.observed(new)), state)
 
-    def expert_pairs(self, key: Array, n: int) -> tuple[Array, Array, Array]:
-        """(s, s') ~ M: features [n, 270] twice, and the condition [n, C]."""
-        s, s_next, phase = expert.pairs(self.kinematics, self.references, key, n)
+    def expert_pairs(self, key: Array, spans: Array) -> tuple[Array, Array, Array]:
+        """(s, s') ~ M, `spans` [n] control steps apart: features [n, 270] twice, and
+        the condition [n, C]."""
+        s, s_next, phase = expert.pairs(
+            self.kinematics, self.references, key, spans, self.config.velocity_time
+        )
         condition = jax.vmap(observation.of_phase)(phase)
         return s, s_next, condition[:, : self.condition_size]
 
@@ -231,7 +234,7 @@ class Environment:
 
     def style_coordinates(self, s: Array, s_next: Array) -> Array:
         """Pairs of features [..., 270] as points [..., 225] in m (`learn.style`)."""
-        return pairs.pair_coordinates(s, s_next, CONTROL_DT)
+        return pairs.pair_coordinates(s, s_next, self.config.velocity_time)
 
     def _drawn(self, key: Array, place_key: Array) -> tuple[RefState, RefState]:
         """The moment of the reference an episode begins at, and the start beside it."""
@@ -281,22 +284,23 @@ class Environment:
             self._root_target(state),
             self.has_phase,
         )
-        body_features = features.unyielded(
+        bodies = features.unyielded(
             self.kinematics,
             self.scene.character_qpos(state.body.qpos),
             state.q_previous,
             compliance.whole_yield(self.controller, state.displacement),
             state.yield_previous,
         )
+        seen = pairs.in_motion(bodies, self.config.velocity_time)
         first = state.time == 0.0
         return dataclasses.replace(
             state,
             obs=obs,
-            features=body_features,
+            features=seen,
             condition=observation.of_phase(state.reference.phase)[
                 : self.condition_size
             ],
-            previous_features=jnp.where(first, body_features, state.previous_features),
+            previous_features=jnp.where(first, seen, state.previous_features),
         )
 
     def _judged(self, state: EnvState) -> EnvState:

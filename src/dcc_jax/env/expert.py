@@ -13,19 +13,29 @@ from dcc_jax import quat
 from dcc_jax.character import Character
 from dcc_jax.env import features
 from dcc_jax.env.features import Kinematics
+from dcc_jax.env.pairs import in_motion
 from dcc_jax.motion.reference import References
 
 Array = jax.Array
 
 
 def pairs(
-    kinematics: Kinematics, references: References, key: Array, n: int
+    kinematics: Kinematics,
+    references: References,
+    key: Array,
+    spans: Array,
+    velocity_time: float,
 ) -> tuple[Array, Array, Array]:
-    """(s, s') ~ M: the features [n, 270] of clips, now and a control step later, and
-    the clip's phase [n] then."""
-    windows, phase = references.sample_windows(key, n)
-    pair = jax.vmap(lambda q, before: features.body_features(kinematics, q, before))
-    s, s_next = pair(windows[:, 1], windows[:, 0]), pair(windows[:, 2], windows[:, 1])
+    """(s, s') ~ M: the features [n, 270] of clips, now and `spans` [n] control steps
+    later, and the clip's phase [n] then."""
+    windows, phase = references.sample_windows(key, spans)
+
+    def seen(q: Array, before: Array) -> Array:
+        bodies = features.body_features(kinematics, q, before)
+        return in_motion(bodies, velocity_time)
+
+    pair = jax.vmap(seen)
+    s, s_next = pair(windows[:, 1], windows[:, 0]), pair(windows[:, 3], windows[:, 2])
     return s, s_next, phase
 
 

@@ -24,6 +24,11 @@ class DiscriminatorConfig:
     hidden: tuple[int, ...] = (256, 256, 256)
     """Widths of its hidden layers (Sec. 5.1)."""
 
+    span: int = 1
+    """Control steps between s and s'; the paper has consecutive ones (Sec. 4.1). Of an
+    episode that is younger, s is its first state, and as many clip pairs are as far
+    apart."""
+
     learning_rate: float = 1e-4
     """Step size of Adam (Sec. 5.1)."""
 
@@ -56,7 +61,7 @@ class DiscriminatorConfig:
             _require(getattr(self, name) > 0, name, getattr(self, name), "positive")
         for name in ("gradient_penalty", "logit_penalty", "instance_noise"):
             _require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more")
-        for name in ("minibatch_size", "minibatches"):
+        for name in ("span", "minibatch_size", "minibatches"):
             _require(getattr(self, name) >= 1, name, getattr(self, name), "1 or more")
         positive = all(width > 0 for width in self.hidden)
         _require(positive, "hidden", self.hidden, "positive widths")
@@ -64,10 +69,10 @@ class DiscriminatorConfig:
 
 @flax.struct.dataclass
 class Pairs:
-    """Features of two consecutive control steps, of a clip or of the policy."""
+    """Features at two moments, of a clip or of the policy."""
 
     s: Array  # [N, F] earlier
-    s_next: Array  # [N, F] one control step later
+    s_next: Array  # [N, F] `DiscriminatorConfig.span` control steps later
     condition: Array  # [N, C] clip label or phase; C may be 0
 
 

@@ -1,6 +1,7 @@
 """Environments over time and over the batch; the only auto-reset of the project.
 
-Letters: T time, B environments, O observation, A actions, F body features, C condition.
+Letters: T time, B environments, O observation, A actions, F body features, C condition,
+K span of the discriminator's pairs.
 """
 
 from __future__ import annotations
@@ -47,6 +48,17 @@ class Running:
 
     env: Any  # EnvState, every leaf [B, ...]
     steps: Array  # [B] int32 control steps since the reset
+    earlier: Array  # [B, K - 1, F] features before now, oldest first
+
+    @property
+    def span(self) -> int:
+        """K."""
+        return self.earlier.shape[1] + 1
+
+    @property
+    def remembered(self) -> Array:
+        """Features [B, K, F] of the last K control steps, or the reset's."""
+        return jnp.concatenate([self.earlier, self.env.features[:, None]], axis=1)
 
 
 @flax.struct.dataclass
@@ -57,6 +69,7 @@ class Transition:
     action: Array  # [T, B, A] rad
     log_prob: Array  # [T, B]
     pairs: Pairs  # [T, B, ...] body features before and after
+    span: Array  # [T, B] int32 control steps between the two
     r_q: Array  # [T, B] read where the environment tracks
     r_p: Array  # [T, B]
     r_task: Array  # [T, B]
@@ -86,10 +99,23 @@ class Rollout:
     incident: Incident
 
 
-def reset_all(keys: Array, environment: Environment, alpha: Array | None) -> Running:
-    """Fresh episodes in as many environments as there are keys, [B]."""
+def reset_all(
+    keys: Array, environment: Environment, alpha: Array | None, span: int = 1
+) -> Running:
+    """Fresh episodes in as many environments as there are keys, [B].
+
+    Args:
+        keys: consumed.
+        environment: the functions of one environment.
+        alpha: level of compliance [], or None: the environment's own.
+        span: K.
+    """
     env = jax.vmap(lambda key: environment.reset(key, alpha))(keys)
-    return Running(env=env, steps=jnp.zeros(keys.shape[0], jnp.int32))
+    return Running(
+        env=env,
+        steps=jnp.zeros(keys.shape[0], jnp.int32),
+        earlier=jnp.repeat(env.features[:, None], span - 1, axis=1),
+    )
 
 
 def rollout(
@@ -192,8 +218,9 @@ def _transition(
         action=action,
         log_prob=log_prob,
         pairs=Pairs(
-            s=env.previous_features, s_next=env.features, condition=env.condition
+            s=before.remembered[:, 0], s_next=env.features, condition=env.condition
         ),
+        span=jnp.minimum(before.steps + 1, before.span),
         r_q=env.r_q,
         r_p=env.r_p,
         r_task=env.r_task,
@@ -223,10 +250,12 @@ def _auto_reset(
     ends = env.terminated | env.truncated
 
     def renewed(running: Running) -> Running:
-        fresh = reset_all(keys, environment, actors.alpha)
+        fresh = reset_all(keys, environment, actors.alpha, before.span)
         return jax.tree.map(lambda new, old: _where(ends, new, old), fresh, running)
 
-    going_on = Running(env=env, steps=before.steps + 1)
+    going_on = Running(
+        env=env, steps=before.steps + 1, earlier=before.remembered[:, 1:]
+    )
     return jax.lax.cond(jnp.any(ends), renewed, lambda running: running, going_on)
 
 

@@ -151,7 +151,12 @@ def init_state(
     lessons = 0 if start is not None else config.train.warm_start_steps
     a_lesson = max(warm_start.SAMPLES // jax.lax.axis_size(AXIS), 1)
     running, obs, action = _begun(
-        of_device(reset_key), environment, alpha, local_envs, lessons * a_lesson
+        of_device(reset_key),
+        environment,
+        alpha,
+        local_envs,
+        lessons * a_lesson,
+        config.disc.span,
     )
     agent = ppo.init_agent(
         agent_key, environment.observation_size, environment.action_size, config.ppo
@@ -167,7 +172,7 @@ def init_state(
         policy = dataclasses.replace(agent.policy, params=start.params)
         agent = dataclasses.replace(agent, policy=policy)
         obs_normalizer = start.normalizer
-    s, _, _ = environment.expert_pairs(expert_key, _EXPERT_SAMPLE)
+    s, _, _ = environment.expert_pairs(expert_key, jnp.ones(_EXPERT_SAMPLE, jnp.int32))
     width = 2 * environment.feature_size + environment.condition_size
     disc = networks.init_mlp(disc_key, (width, *config.disc.hidden, 1))
     return TrainState(
@@ -191,6 +196,7 @@ def _begun(
     alpha: Array | None,
     local_envs: int,
     samples: int,
+    span: int,
 ) -> tuple[Running, Array, Array]:
     """Environments at a reset, and demonstrations of what leads on from there.
 
@@ -203,6 +209,7 @@ def _begun(
         alpha: [] level of compliance, or None: the environment's own.
         local_envs: B.
         samples: demonstrations; 0: those of one round.
+        span: K.
 
     Returns:
         The environments, and obs [N, O] and action [N, A] of the demonstrations.
@@ -212,11 +219,11 @@ def _begun(
     keys = jax.random.split(key, (rounds, size))
 
     def one(_: Running, keys: Array) -> tuple[Running, tuple[Array, Array]]:
-        begun = reset_all(keys, environment, alpha)
+        begun = reset_all(keys, environment, alpha, span)
         action = jax.vmap(environment.expert_action)(begun.env)
         return begun, (begun.env.obs, action)
 
-    shapes = jax.eval_shape(lambda: reset_all(keys[0], environment, alpha))
+    shapes = jax.eval_shape(lambda: reset_all(keys[0], environment, alpha, span))
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     begun, shown = jax.lax.scan(one, nothing, keys)
     obs, action = (x.reshape(rounds * size, x.shape[-1]) for x in shown)

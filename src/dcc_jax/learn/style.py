@@ -33,7 +33,7 @@ _SEED = 20220707  # of the pairs, the same in every run, so that runs can be com
 class Posed(Protocol):
     """The part of an environment that is read here."""
 
-    def expert_pairs(self, key: Array, n: int) -> tuple[Array, Array, Array]: ...
+    def expert_pairs(self, key: Array, spans: Array) -> tuple[Array, Array, Array]: ...
     def style_coordinates(self, s: Array, s_next: Array) -> Array: ...
 
 
@@ -48,7 +48,7 @@ class Reference:
 
 def make_reference(environment: Posed, count: int = CLIP_PAIRS) -> Reference:
     """M pairs of an environment's clips and their Gaussian; equal for equal clips."""
-    s, s_next, _ = environment.expert_pairs(jax.random.key(_SEED), count)
+    s, s_next, _ = environment.expert_pairs(jax.random.key(_SEED), _next(count))
     pairs = environment.style_coordinates(s, s_next)
     mean, covariance = _moments(pairs, jnp.ones(count))
     values, vectors = jnp.linalg.eigh(covariance)
@@ -103,7 +103,7 @@ def of_running(environment: Posed, running: Running) -> dict[str, Array]:
 
 def floor(environment: Posed, reference: Reference, count: int = 512) -> Array:
     """`style/nearest` [] in m of other pairs of the clips: nothing comes nearer."""
-    s, s_next, _ = environment.expert_pairs(jax.random.key(_SEED + 1), count)
+    s, s_next, _ = environment.expert_pairs(jax.random.key(_SEED + 1), _next(count))
     return jnp.mean(nearest(reference, environment.style_coordinates(s, s_next)))
 
 
@@ -114,6 +114,11 @@ def measure(reference: Reference, points: Array, weight: Array) -> dict[str, Arr
         "style/nearest": distance,
         "style/frechet": frechet(reference, points, weight),
     }
+
+
+def _next(count: int) -> Array:
+    """Pairs of consecutive control steps."""
+    return jnp.ones(count, jnp.int32)
 
 
 def _moments(points: Array, weight: Array) -> tuple[Array, Array]:

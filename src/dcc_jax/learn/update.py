@@ -75,7 +75,7 @@ def update_state(
     seen = {"obs": normalizer.moments(_flat(taken.transitions.obs))}
     if not environment.tracks_reference:
         disc, of_disc, features = _train_discriminator(
-            disc_key, state, taken.transitions.pairs, environment, config
+            disc_key, state, taken.transitions, environment, config
         )
         metrics |= of_disc
         seen |= {"features": features}
@@ -113,7 +113,7 @@ def _policy_waiting(state: TrainState, agent: ppo.Agent) -> ppo.Agent:
 def _train_discriminator(
     key: Array,
     state: TrainState,
-    pairs: Pairs,
+    transitions: Transition,
     environment: Environment,
     config: LearnerConfig,
 ) -> tuple[networks.Network, dict[str, Array], Normalizer]:
@@ -124,11 +124,12 @@ def _train_discriminator(
     size = config.disc.minibatch_size // jax.lax.axis_size(AXIS)
     count = config.disc.minibatches * size
     expert_key, row_key, noise_key = jax.random.split(key, 3)
-    expert = Pairs(*environment.expert_pairs(expert_key, count))
-    flat = jax.tree.map(_flat, pairs)
+    flat = jax.tree.map(_flat, transitions.pairs)
     share, tuples = jax.random.uniform(row_key, (count,)), flat.s.shape[0]
     rows = (share * tuples).astype(jnp.int32)
     policy = jax.tree.map(lambda x: x[rows], flat)
+    spans = _flat(transitions.span)[rows]
+    expert = Pairs(*environment.expert_pairs(expert_key, spans))
 
     normal = state.feature_normalizer
     x_expert = discriminator.inputs(normal, expert, config.disc)

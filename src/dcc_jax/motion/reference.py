@@ -137,21 +137,26 @@ class References:
             travel=_turned(turn, state.travel),
         )
 
-    def sample_windows(self, key: Array, count: int) -> tuple[Array, Array]:
-        """Expert windows [N, 3, 55] for the discriminator: previous, now, next; and the
-        clip's phase [N] at the last of them.
+    def sample_windows(self, key: Array, spans: Array) -> tuple[Array, Array]:
+        """Expert windows [N, 4, 55] for the discriminator, and the clip's phase [N] at
+        the last pose: previous and now, and the same `spans` control steps later.
 
-        Three poses one control step apart; none reaches past the end of a clip.
+        None reaches past the end of a clip; a clip too short for it holds its last
+        pose.
+
+        Args:
+            key: random key, consumed.
+            spans: control steps from now to later, 1 or more, [N].
         """
-        draws = jax.random.uniform(key, (2, count))
+        draws = jax.random.uniform(key, (2, len(spans)))
         clip = self._drawn(draws[0])
-        span = self.duration[clip] - jnp.where(
-            self.loop[clip], 0.0, 2.0 * self.control_dt
-        )
-        start = draws[1] * span
-        times = start[:, None] + self.control_dt * jnp.arange(3)
+        length = self.control_dt * (1.0 + spans)
+        room = self.duration[clip] - jnp.where(self.loop[clip], 0.0, length)
+        start = draws[1] * jnp.maximum(room, 0.0)
+        steps = jnp.stack([0.0 * spans, 1.0 + 0.0 * spans, spans, 1.0 + spans], axis=1)
+        times = start[:, None] + self.control_dt * steps
         at = jax.vmap(jax.vmap(self.qpos_at, (None, 0)))
-        return at(clip, times), jax.vmap(self.phase_at)(clip, times[:, 2])
+        return at(clip, times), jax.vmap(self.phase_at)(clip, times[:, 3])
 
     def _travel(self, clip: Array | int, time: Array) -> Array:
         cycle, _, _ = self._place(clip, time)

@@ -51,7 +51,11 @@ class Locomotion(Task):
     )
     state_size: ClassVar[int] = SEEN
     trackable: ClassVar[bool] = False
-    config_overrides: ClassVar[Mapping[str, Any]] = {"ppo.sigma_degrees": 3.0}
+    config_overrides: ClassVar[Mapping[str, Any]] = {
+        "ppo.sigma_degrees": 3.0,
+        "disc.span": 10,
+        "env.velocity_time": 0.1,
+    }
 
     gaits: Gaits = field(
         default_factory=lambda: Gaits(speeds=(0.0, 0.8, 1.2, 1.6, 2.0, 2.5, 3.0))
