@@ -100,6 +100,15 @@ def test_checkpoint_of_an_older_version_is_refused_in_one_line(run_dir):
         checkpoint.restore_latest(run_dir, _state(0), _silent)
 
 
+def test_state_of_another_meaning_is_refused(run_dir, monkeypatch):
+    with monkeypatch.context() as earlier:
+        earlier.setattr(checkpoint, "_FORMAT", checkpoint._FORMAT - 1)
+        checkpoint.save(run_dir, 6, _state(6), keep=3)
+        assert checkpoint.restore_latest(run_dir, _state(0), _silent) is not None
+    with pytest.raises(ValueError, match=r"000000006 was written by an older version"):
+        checkpoint.restore_latest(run_dir, _state(0), _silent)
+
+
 def test_update_is_saved_although_a_later_one_is_damaged(run_dir):
     _flip_a_byte(run_dir / "checkpoints" / "000000004")
     checkpoint.save(run_dir, 3, _state(3), keep=3)

@@ -2,8 +2,8 @@
 
 A checkpoint is `checkpoints/000000050/`, which orbax's `CheckpointManager` writes
 elsewhere and renames into place when it is whole. It has two items: `state`, every
-array by its name, and `digests`, a SHA-256 of every array. What orbax reads is compared
-with them, so that a damaged checkpoint is never resumed from.
+array by its name and the format, and `digests`, a SHA-256 of every array. What orbax
+reads is compared with them, so that a damaged checkpoint is never resumed from.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import shutil
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NoReturn, cast
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,9 @@ from dcc_jax.learn.rollout import Policy
 
 _FOLDER = "checkpoints"
 _DIGITS = 9  # of an update in the name of its checkpoint
+_FORMAT = 2
+"""Of a state: raised when its arrays come to mean something else. 2: the discriminator
+sees velocities."""
 
 
 class CheckpointError(RuntimeError):
@@ -46,7 +49,7 @@ def save(run_dir: Path, update: int, state: Any, keep: int) -> Path:
         CheckpointError: it could not be written; the earlier ones are as they were.
     """
     path = _path(run_dir, update)
-    arrays = to_arrays(state)
+    arrays = to_arrays(state) | {"format": np.array(_FORMAT)}
     items = ocp.args.Composite(
         state=ocp.args.StandardSave(arrays),
         digests=ocp.args.JsonSave(_digests(arrays)),
@@ -91,12 +94,15 @@ def restore_latest(
     updates = available(run_dir)
     for update in updates:
         path = _path(run_dir, update)
-        _refuse_old_format(path)
+        if path.with_name(f"{path.name}.sha256").exists():
+            _refuse(path)
         try:
             arrays = _read(run_dir, update)
         except CheckpointError as error:
             say(f"skipping damaged checkpoint {path}: {error}")
             continue
+        if arrays.pop("format", None) != _FORMAT:
+            _refuse(path)
         return update, from_arrays(arrays, template)
     if updates:
         raise CheckpointError(f"every checkpoint in {run_dir / _FOLDER} is damaged")
@@ -244,12 +250,11 @@ def _digests(arrays: dict[str, np.ndarray]) -> dict[str, str]:
     }
 
 
-def _refuse_old_format(path: Path) -> None:
-    if path.with_name(f"{path.name}.sha256").exists():
-        raise ValueError(
-            f"{path} was written by an older version of dcc_jax, whose runs cannot be "
-            "resumed; its policy.npz still serves"
-        )
+def _refuse(path: Path) -> NoReturn:
+    raise ValueError(
+        f"{path} was written by an older version of dcc_jax, whose runs cannot be "
+        "resumed; the policy.npz of the run still serves"
+    )
 
 
 def _discard(path: Path) -> None:
