@@ -7,8 +7,9 @@ ONE environment. `q` is the character's own part of qpos, [55].
 One body contributes 18 numbers, in this order: its position now (3) and one control
 step ago (3), the x and y columns of its rotation matrix now (6) and then (6). All are
 expressed in the character's current local frame: the root projected on the ground,
-turned by its heading alone. 15 bodies make 270, which the discriminator sees; the
-policy sees log u of the 12 joints (36) on top, the paper's 306.
+turned by its heading alone. 15 bodies make 270, of which the discriminator sees the
+past as velocities (`env.pairs`); the policy sees log u of the 12 joints (36) on top,
+the paper's 306.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ Array = jax.Array
 BODY_FEATURE_SIZE = 18
 """Numbers a body contributes: position now and then, two columns now and then."""
 FEATURE_SIZE = BODY_FEATURE_SIZE * len(BODIES)
-"""What the discriminator sees of a state, 270."""
+"""Of all bodies, 270."""
 STATE_SIZE = FEATURE_SIZE + Character.num_joint_dofs
 """What the policy sees of it, 306 (Sec. 4.2)."""
 
@@ -160,7 +161,7 @@ def local_frame(q: Array) -> tuple[Array, Array]:
 
 
 def body_features(kinematics: Kinematics, q: Array, q_previous: Array) -> Array:
-    """What the discriminator sees of one state, [270]; layout in the module docstring.
+    """The bodies of one state, [270]; layout in the module docstring.
 
     Args:
         kinematics: the character's tree.
