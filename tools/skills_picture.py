@@ -21,7 +21,7 @@ MOMENTS = {
     "ball": (1, 0),
     "chicken-fight": (1, 3),
     "sustained-push": (2, 0),
-    "locomotion": (1, 2),
+    "locomotion": (1, 0),
 }
 """Row and column in the strip of each skill, chosen by eye."""
 
