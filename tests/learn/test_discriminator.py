@@ -71,7 +71,10 @@ def test_instance_noise_is_on_both_features_and_not_on_the_condition():
     )
 
 
-@pytest.mark.parametrize(("name", "value"), [("minibatches", 0), ("hidden", (-1,))])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("minibatches", 0), ("hidden", (-1,)), ("span", 0), ("span", 1000)],
+)
 def test_value_out_of_range_is_named(name, value):
     with pytest.raises(ValueError, match=rf"disc\.{name} must be .*, got"):
         DiscriminatorConfig(**{name: value})

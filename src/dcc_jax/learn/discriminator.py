@@ -15,6 +15,8 @@ from dcc_jax.learn import networks, normalizer
 from dcc_jax.learn.exchange import mean_tree
 
 Array = jax.Array
+LONGEST_SPAN = 90
+"""Control steps, 3 s: every environment keeps as many states."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,8 @@ class DiscriminatorConfig:
             _require(getattr(self, name) > 0, name, getattr(self, name), "positive")
         for name in ("gradient_penalty", "logit_penalty", "instance_noise"):
             _require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more")
-        for name in ("span", "minibatch_size", "minibatches"):
+        _require(1 <= self.span <= LONGEST_SPAN, "span", self.span, "1 to 90")
+        for name in ("minibatch_size", "minibatches"):
             _require(getattr(self, name) >= 1, name, getattr(self, name), "1 or more")
         positive = all(width > 0 for width in self.hidden)
         _require(positive, "hidden", self.hidden, "positive widths")
