@@ -103,6 +103,13 @@ def _motion(force: np.ndarray, **other: np.ndarray) -> Motion:
     )
 
 
+def test_arrow_of_a_contact_between_the_frames_is_no_longer():
+    force = np.zeros((12, 1, 3))
+    force[4, 0, 0] = 250.0  # a frame later the ball is gone
+    (frame,) = pictures.arrows(_motion(force), np.array([5]), np.array([0]))
+    assert np.linalg.norm(frame[0][1]) == pytest.approx(pictures.LONGEST_ARROW)
+
+
 def test_arrow_of_a_short_contact_fades_and_the_largest_is_the_longest():
     force = np.zeros((12, 1, 3))
     force[2, 0], force[6, 0] = [200.0, 0.0, 0.0], [0.0, 0.0, 400.0]

@@ -103,7 +103,8 @@ def view_of(task: Task, camera: Sequence[float] = (), still: bool = False) -> dr
 def arrows(
     motion: Motion, times: np.ndarray, episodes: np.ndarray
 ) -> list[list[draw.Arrow]]:
-    """Of each frame. A force fades over `ECHO` frames, so that one can see it.
+    """Of each frame. A force fades over `ECHO` frames, so that one can see it; the
+    largest that is seen is `LONGEST_ARROW` long.
 
     Args:
         motion: of all episodes [T, N, ...].
@@ -112,24 +113,25 @@ def arrows(
     """
     force, point = np.asarray(motion.force_w), np.asarray(motion.point_w)
     size = np.linalg.norm(force, axis=-1)
-    scale = LONGEST_ARROW / max(float(size[times, episodes].max()), 1e-6)
-    frames = []
+    frames, largest = [], 1e-6
     for time, episode in zip(times, episodes, strict=True):
         begin = max(0, time - ECHO + 1)
         recent = size[begin : time + 1, episode]  # [at most ECHO, F]
         fading = 1.0 - (len(recent) - 1 - np.arange(len(recent))) / ECHO
         faded = recent * fading[:, None]
+        largest = max(largest, float(faded.max()))
         last = faded.argmax(axis=0)
         frames.append(
             [
                 (
                     point[begin + at, episode, f],
-                    scale * fading[at] * force[begin + at, episode, f],
+                    fading[at] * force[begin + at, episode, f],
                 )
                 for f, at in enumerate(last)
             ]
         )
-    return frames
+    scale = LONGEST_ARROW / largest
+    return [[(at, scale * shaft) for at, shaft in frame] for frame in frames]
 
 
 def caption(
