@@ -203,6 +203,8 @@ def main() -> None:
     options = parser.parse_args()
     springs = OBSTACLES if options.press else SPRINGS
     task = find_run(options.run).config.task.quiet()
+    if options.press and not hasattr(task, "gaits"):
+        parser.error(f"--press: nobody tells a character of {task.name} where to go")
     if options.press:
         task = dataclasses.replace(task, gaits=Gaits(speeds=(0.0,)))
     report = dcc_jax.evaluate(

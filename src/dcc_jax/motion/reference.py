@@ -153,7 +153,8 @@ class References:
         length = self.control_dt * (1.0 + spans)
         room = self.duration[clip] - jnp.where(self.loop[clip], 0.0, length)
         start = draws[1] * jnp.maximum(room, 0.0)
-        steps = jnp.stack([0.0 * spans, 1.0 + 0.0 * spans, spans, 1.0 + spans], axis=1)
+        now = jnp.ones_like(spans)
+        steps = jnp.stack([now - 1, now, spans, spans + 1], axis=1)
         times = start[:, None] + self.control_dt * steps
         at = jax.vmap(jax.vmap(self.qpos_at, (None, 0)))
         return at(clip, times), jax.vmap(self.phase_at)(clip, times[:, 3])
