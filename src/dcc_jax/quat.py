@@ -178,11 +178,11 @@ class Coordinates:
 
     def split_q(self, q: Array) -> tuple[Array, Array]:
         """Scalars [..., S] and quaternions [..., K, 4] of q [..., nq]."""
-        return q[..., self.scalar_qpos], q[..., self.quat_qpos]
+        return _entries(q, self.scalar_qpos), _entries(q, self.quat_qpos)
 
     def split_v(self, v: Array) -> tuple[Array, Array]:
         """Scalars [..., S] and tangents [..., K, 3] of v [..., nv]."""
-        return v[..., self.scalar_dof], v[..., self.quat_dof]
+        return _entries(v, self.scalar_dof), _entries(v, self.quat_dof)
 
     def join_q(self, scalars: Array, quats: Array) -> Array:
         """The inverse of `split_q`."""
@@ -190,7 +190,7 @@ class Coordinates:
             [scalars, quats.reshape(*quats.shape[:-2], self.quat_qpos.size)], axis=-1
         )
         order = np.concatenate([self.scalar_qpos, self.quat_qpos.ravel()])
-        return flat[..., np.argsort(order)]
+        return _entries(flat, np.argsort(order))
 
     def join_v(self, scalars: Array, tangents: Array) -> Array:
         """The inverse of `split_v`."""
@@ -199,7 +199,16 @@ class Coordinates:
             axis=-1,
         )
         order = np.concatenate([self.scalar_dof, self.quat_dof.ravel()])
-        return flat[..., np.argsort(order)]
+        return _entries(flat, np.argsort(order))
+
+
+def _entries(x: Array, indices: np.ndarray) -> Array:
+    """x[..., indices], as a slice where they follow one another: XLA gathers slowly."""
+    flat = indices.ravel()
+    if len(flat) and np.all(np.diff(flat) == 1):
+        part = x[..., flat[0] : flat[-1] + 1]
+        return part.reshape(*x.shape[:-1], *indices.shape)
+    return x[..., indices]
 
 
 def identity(coords: Coordinates) -> Array:
