@@ -100,6 +100,17 @@ def test_checkpoint_of_an_older_version_is_refused_in_one_line(run_dir):
         checkpoint.restore_latest(run_dir, _state(0), _silent)
 
 
+def test_policy_of_another_meaning_is_refused(tmp_path, monkeypatch):
+    with monkeypatch.context() as earlier:
+        earlier.setattr(checkpoint, "_FORMAT", checkpoint._FORMAT - 1)
+        checkpoint.save_policy(tmp_path, _policy())
+        checkpoint.load_policy(tmp_path)
+    with pytest.raises(
+        ValueError, match=r"policy\.npz was written by an older version"
+    ):
+        checkpoint.load_policy(tmp_path)
+
+
 def test_state_of_another_meaning_is_refused(run_dir, monkeypatch):
     with monkeypatch.context() as earlier:
         earlier.setattr(checkpoint, "_FORMAT", checkpoint._FORMAT - 1)

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from dcc_jax.character import load_character
+from dcc_jax.character import CONTROL_DT, load_character
 from dcc_jax.env import features
 
 CHARACTER = load_character()
@@ -37,6 +37,11 @@ def body_features(q: np.ndarray, q_previous: np.ndarray) -> np.ndarray:
         *(jnp.asarray(x, jnp.float32) for x in (*padded, IDENTITY, IDENTITY))
     )
     return np.asarray(values)[: len(q), :270].reshape(-1, 15, 18)
+
+
+def over_a_step(bodies: np.ndarray) -> np.ndarray:
+    """The bodies' part [..., 15, 18] with changes over a control step, not rates."""
+    return bodies * np.repeat([1.0, CONTROL_DT, 1.0, CONTROL_DT], [3, 3, 6, 6])
 
 
 def random_poses(seed: int, spread: float) -> np.ndarray:
@@ -103,15 +108,15 @@ def test_features_of_random_poses_equal_mujocos_seen_from_the_root():
         c, s = forward[:2] / np.hypot(*forward[:2])
         to_local = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
         origin = np.array([*q[i, :2], 0.0])
-        expected = [(now[i] - origin) @ to_local.T, (then[i] - origin) @ to_local.T]
-        for orientations in (now_quat[i], then_quat[i]):
-            columns = np.zeros((15, 6))
+        position, moved = (now[i] - origin) @ to_local.T, (now - then)[i] @ to_local.T
+        columns = np.zeros((2, 15, 6))
+        for row, orientations in zip(columns, (now_quat[i], then_quat[i]), strict=True):
             for body, orientation in enumerate(orientations):
                 matrix = np.zeros(9)
                 mujoco.mju_quat2Mat(matrix, orientation)
-                columns[body] = (to_local @ matrix.reshape(3, 3))[:, :2].T.ravel()
-            expected.append(columns)
-        np.testing.assert_allclose(bodies, np.hstack(expected), atol=1e-5)
+                row[body] = (to_local @ matrix.reshape(3, 3))[:, :2].T.ravel()
+        expected = position, moved, columns[0], columns[0] - columns[1]
+        np.testing.assert_allclose(over_a_step(bodies), np.hstack(expected), atol=1e-5)
 
 
 def test_features_of_the_t_pose_by_hand():
@@ -120,14 +125,12 @@ def test_features_of_the_t_pose_by_hand():
     previous = q.copy()
     previous[0] -= 0.1
     (bodies,) = body_features(q[None], previous[None])
-    columns = [1, 0, 0, 0, 1, 0]
+    columns, forward = [1, 0, 0, 0, 1, 0], [0.1 / CONTROL_DT, 0, 0]
     np.testing.assert_allclose(
-        bodies[0], [0, 0, 0.935, -0.1, 0, 0.935, *columns, *columns], atol=1e-6
+        bodies[0], [0, 0, 0.935, *forward, *columns, *np.zeros(6)], atol=1e-5
     )
     height = 0.935 + 0.12 + 0.28
-    np.testing.assert_allclose(
-        bodies[HAND, :6], [0, 0.69, height, -0.1, 0.69, height], atol=1e-6
-    )
+    np.testing.assert_allclose(bodies[HAND, :6], [0, 0.69, height, *forward], atol=1e-5)
 
 
 def test_features_see_a_turn_since_the_previous_step():
@@ -136,8 +139,11 @@ def test_features_see_a_turn_since_the_previous_step():
         :, : HAND + 1
     ]
     s, c = np.sin(0.3), np.cos(0.3)
-    np.testing.assert_allclose(hand[3:5], [0.69 * s, 0.69 * c], atol=1e-6)
-    np.testing.assert_allclose(hand[12:], [c, -s, 0.0, s, c, 0.0], atol=1e-6)
+    hand = over_a_step(hand)
+    np.testing.assert_allclose(hand[3:5], [-0.69 * s, 0.69 * (1.0 - c)], atol=1e-6)
+    np.testing.assert_allclose(
+        hand[12:], [1.0 - c, s, 0.0, -s, 1.0 - c, 0.0], atol=1e-6
+    )
 
 
 def test_features_do_not_change_with_heading_and_place_on_the_ground():
@@ -148,9 +154,8 @@ def test_features_do_not_change_with_heading_and_place_on_the_ground():
     previous_there = np.array(
         [carried(x, *move) for x, move in zip(previous, moves, strict=True)]
     )
-    np.testing.assert_allclose(
-        body_features(q, previous), body_features(q_there, previous_there), atol=1e-5
-    )
+    here, there = body_features(q, previous), body_features(q_there, previous_there)
+    np.testing.assert_allclose(over_a_step(here), over_a_step(there), atol=1e-5)
 
 
 def test_features_do_change_with_height_and_tilt():
@@ -186,7 +191,8 @@ def test_state_of_a_character_that_follows_the_displaced_clip_is_the_clips():
     value = states(*(jnp.asarray(x, jnp.float32) for x in (*poses, *displacements)))
     assert value.shape == (BATCH, 306)
     clip = body_features(q_m, q_m_previous)
-    np.testing.assert_allclose(value[:, :270].reshape(clip.shape), clip, atol=1e-5)
+    bodies = value[:, :270].reshape(clip.shape)
+    np.testing.assert_allclose(over_a_step(bodies), over_a_step(clip), atol=1e-5)
     np.testing.assert_allclose(value[:, 270:], v[:, 6:], atol=1e-6)
 
 
@@ -195,7 +201,7 @@ def test_policy_and_discriminator_see_the_same_bodies():
     alone = jax.jit(lambda q, p: features.body_features(KINEMATICS, q, p))(q, previous)
     assert alone.shape == (270,)
     batched = body_features(np.asarray(q)[None], np.asarray(previous)[None])
-    np.testing.assert_allclose(alone, batched.ravel(), atol=5e-6)
+    np.testing.assert_allclose(alone, batched.ravel(), atol=5e-6 / CONTROL_DT)
 
 
 ROOT = '<body name="trunk"><freejoint/><geom size=".1"/>{}</body>'

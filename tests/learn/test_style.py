@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from dcc_jax.env.pairs import COLUMN_ARM, VELOCITY_TIME, in_motion, pair_coordinates
+from dcc_jax.env.pairs import COLUMN_ARM, VELOCITY_TIME, pair_coordinates, weighed
 from dcc_jax.learn import style
 from toy import Toy
 
@@ -89,8 +89,9 @@ def test_environments_that_were_just_reset_do_not_count():
 def _features(position: np.ndarray, before: np.ndarray, columns: np.ndarray):
     """[270] of bodies at positions [15, 3] now and then, one turn for all [6]."""
     turn = np.broadcast_to(columns, (15, 6))
-    bodies = np.concatenate([position, before, turn, turn], 1).ravel()
-    return in_motion(jnp.array(bodies), TIME)
+    velocity = (position - before) / DT
+    bodies = np.concatenate([position, velocity, turn, np.zeros((15, 6))], 1).ravel()
+    return weighed(jnp.array(bodies), TIME)
 
 
 def test_pair_moved_as_a_whole_is_as_far_away():
@@ -119,14 +120,13 @@ def test_speed_and_turn_count_as_the_constants_say():
         assert float(jnp.linalg.norm(gap)) == pytest.approx(expected, rel=1e-4)
 
 
-def test_the_past_is_seen_as_a_change_and_nothing_is_lost():
-    rng = np.random.default_rng(2)
-    parts = rng.normal(size=(4, 15, 18)).astype(np.float32)
-    seen = np.asarray(in_motion(jnp.array(parts.reshape(4, 270)), TIME))
-    pos, velocity, columns, rate = np.split(seen.reshape(4, 15, 18), [3, 6, 12], axis=2)
-    per = TIME / DT
-    back = [pos, pos - velocity / per, columns, columns - rate / per]
-    np.testing.assert_allclose(np.concatenate(back, 2), parts, atol=1e-5)
+def test_a_velocity_weighs_as_much_as_the_way_it_makes_in_that_time():
+    bodies = np.ones((2, 15, 18), np.float32)
+    seen = np.asarray(weighed(jnp.array(bodies.reshape(2, 270)), TIME))
+    pos, velocity, columns, rate = np.split(seen.reshape(2, 15, 18), [3, 6, 12], axis=2)
+    assert np.all(pos == 1.0) and np.all(columns == 1.0)
+    np.testing.assert_allclose(velocity, TIME)
+    np.testing.assert_allclose(rate, TIME)
 
 
 def test_floor_is_the_distance_of_other_pairs_of_the_clips(reference):

@@ -291,7 +291,7 @@ class Environment:
             compliance.whole_yield(self.controller, state.displacement),
             state.yield_previous,
         )
-        seen = pairs.in_motion(bodies, self.config.velocity_time)
+        seen = pairs.weighed(bodies, self.config.velocity_time)
         first = state.time == 0.0
         return dataclasses.replace(
             state,

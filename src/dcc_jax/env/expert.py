@@ -13,7 +13,7 @@ from dcc_jax import quat
 from dcc_jax.character import Character
 from dcc_jax.env import features
 from dcc_jax.env.features import Kinematics
-from dcc_jax.env.pairs import in_motion
+from dcc_jax.env.pairs import weighed
 from dcc_jax.motion.reference import References
 
 Array = jax.Array
@@ -32,7 +32,7 @@ def pairs(
 
     def seen(q: Array, before: Array) -> Array:
         bodies = features.body_features(kinematics, q, before)
-        return in_motion(bodies, velocity_time)
+        return weighed(bodies, velocity_time)
 
     pair = jax.vmap(seen)
     s, s_next = pair(windows[:, 1], windows[:, 0]), pair(windows[:, 3], windows[:, 2])

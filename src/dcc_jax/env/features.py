@@ -1,15 +1,20 @@
-"""The state of Sec. 4.2 without velocities: where the bodies are and where they were.
+"""The state of Sec. 4.2: where the bodies are and how they move.
 
 Body poses come from our own kinematics on qpos, so that they can be taken of q (-) u,
 of a clip and of a reset state alike, without a physics step. Everything is written for
 ONE environment. `q` is the character's own part of qpos, [55].
 
-One body contributes 18 numbers, in this order: its position now (3) and one control
-step ago (3), the x and y columns of its rotation matrix now (6) and then (6). All are
-expressed in the character's current local frame: the root projected on the ground,
-turned by its heading alone. 15 bodies make 270, of which the discriminator sees the
-past as velocities (`env.pairs`); the policy sees log u of the 12 joints (36) on top,
-the paper's 306.
+One body contributes 18 numbers, in this order: its position (3, m), its velocity over
+the last control step (3, m/s), the x and y columns of its rotation matrix (6) and their
+rate (6, 1/s). All are expressed in the character's current local frame: the root
+projected on the ground, turned by its heading alone. 15 bodies make 270, of which the
+discriminator weighs the velocities (`env.pairs`); the policy sees log u of the 12
+joints (36) on top, the paper's 306.
+
+Departure: the paper has positions and columns now and a control step ago. Both say the
+same, but there a velocity is the small difference of two numbers that are divided by
+the spread of positions: it is hard to learn from, and a discriminator that is smooth,
+and has noise on what it sees, hardly sees it.
 """
 
 from __future__ import annotations
@@ -23,12 +28,18 @@ import mujoco
 import numpy as np
 
 from dcc_jax import quat
-from dcc_jax.character import BODIES, Character, compose_scene, load_character
+from dcc_jax.character import (
+    BODIES,
+    CONTROL_DT,
+    Character,
+    compose_scene,
+    load_character,
+)
 
 Array = jax.Array
 
 BODY_FEATURE_SIZE = 18
-"""Numbers a body contributes: position now and then, two columns now and then."""
+"""Numbers a body contributes: position and velocity, two columns and their rate."""
 FEATURE_SIZE = BODY_FEATURE_SIZE * len(BODIES)
 """Of all bodies, 270."""
 STATE_SIZE = FEATURE_SIZE + Character.num_joint_dofs
@@ -175,7 +186,9 @@ def body_features(kinematics: Kinematics, q: Array, q_previous: Array) -> Array:
     to_local = quat.inv(heading)
     pos = quat.rotate(to_local, pos_w - origin)
     columns = _two_columns(quat.mul(to_local, quat_w))
-    return jnp.concatenate([pos[0], pos[1], columns[0], columns[1]], axis=-1).ravel()
+    (pos, then), (columns, columns_then) = pos, columns
+    velocity, rate = (pos - then) / CONTROL_DT, (columns - columns_then) / CONTROL_DT
+    return jnp.concatenate([pos, velocity, columns, rate], axis=-1).ravel()
 
 
 def state(
@@ -202,7 +215,7 @@ def unyielded(
     From each pose the displacement of its own time is taken off. A character that
     follows q_m (+) u exactly then yields the features of the clip exactly, which is
     what lets undisplaced clips serve as expert (Sec. 4.2). Taking today's u off both
-    would leave the motion of u itself in the difference between now and then.
+    would leave the motion of u itself in the velocities.
 
     Args:
         kinematics: the character's tree.

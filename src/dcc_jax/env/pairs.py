@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dcc_jax.character import CONTROL_DT
+from dcc_jax.character import BODIES
 from dcc_jax.env.features import BODY_FEATURE_SIZE
 
 Array = jax.Array
@@ -15,30 +15,19 @@ COLUMN_ARM = 0.1  # m; a body turned by 1 rad is about 0.14 m away
 VELOCITY_TIME = 0.1  # s; a body faster by 1 m/s is 0.1 m away
 
 
-def in_motion(bodies: Array, velocity_time: float) -> Array:
-    """`body_features` [..., 270] with velocities instead of where bodies were.
-
-    A body contributes its position (m), its velocity times `velocity_time` (m), its two
-    columns, and their rate times `velocity_time`.
-
-    Departure: the paper has positions and columns now and then (Sec. 4.2). Both say the
-    same, but there a velocity is the small difference of two numbers that are divided
-    by the spread of positions: a discriminator that is smooth, and has noise on what it
-    sees, hardly sees it.
+def weighed(bodies: Array, velocity_time: float) -> Array:
+    """`body_features` [..., 270] with velocities and rates times `velocity_time`.
 
     Args:
         bodies: [..., 270].
         velocity_time: s, 1 m/s counts as much as this many m.
     """
-    parts = bodies.reshape(*bodies.shape[:-1], -1, BODY_FEATURE_SIZE)
-    pos, then, columns, columns_then = jnp.split(parts, [3, 6, 12], axis=-1)
-    per = velocity_time / CONTROL_DT
-    moving = [pos, per * (pos - then), columns, per * (columns - columns_then)]
-    return jnp.concatenate(moving, axis=-1).reshape(bodies.shape)
+    one = np.repeat([1.0, velocity_time, 1.0, velocity_time], [3, 3, 6, 6])
+    return bodies * jnp.asarray(np.tile(one, len(BODIES)), bodies.dtype)
 
 
 def pair_coordinates(s: Array, s_next: Array, velocity_time: float) -> Array:
-    """A pair of `in_motion` as a point [..., 225] in m; Euclidean distances count.
+    """A pair of `weighed` features as a point [..., 225] in m, by Euclidean distance.
 
     A body contributes its position, its two columns times `COLUMN_ARM`, and its
     velocity in s' and in s times `VELOCITY_TIME`. All is divided by the root of the

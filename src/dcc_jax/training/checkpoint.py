@@ -27,9 +27,9 @@ from dcc_jax.learn.rollout import Policy
 
 _FOLDER = "checkpoints"
 _DIGITS = 9  # of an update in the name of its checkpoint
-_FORMAT = 2
-"""Of a state: raised when its arrays come to mean something else. 2: the discriminator
-sees velocities."""
+_FORMAT = 3
+"""Of states and policies: raised when their arrays come to mean something else. 3:
+discriminator and policy see velocities."""
 
 
 class CheckpointError(RuntimeError):
@@ -142,7 +142,10 @@ def save_policy(directory: Path, policy: Policy) -> Path:
     """Writes `policy.npz`, a few hundred kB, replacing an older one atomically."""
     path = directory / "policy.npz"
     partial = directory / "policy.partial.npz"
-    arrays = to_arrays(policy) | {"activation": np.array(policy.params.activation)}
+    arrays = to_arrays(policy) | {
+        "activation": np.array(policy.params.activation),
+        "format": np.array(_FORMAT),
+    }
     np.savez(partial, **arrays)  # pyright: ignore[reportArgumentType]
     os.replace(partial, path)
     return path
@@ -152,7 +155,8 @@ def load_policy(directory: Path) -> Policy:
     """The policy in a run directory or one that ships with the package.
 
     Raises:
-        ValueError: there is no `policy.npz`, or it is damaged.
+        ValueError: there is no `policy.npz`, it is damaged, or an older version of this
+            package wrote it.
     """
     path = Path(directory) / "policy.npz"
     try:
@@ -170,7 +174,7 @@ def load_policy(directory: Path) -> Policy:
             )
             for i in range(count)
         )
-        return Policy(
+        policy = Policy(
             params=Mlp(layers=layers, activation=_activation(arrays)),
             normalizer=Normalizer(**normalizer),
         )
@@ -178,6 +182,9 @@ def load_policy(directory: Path) -> Policy:
         raise ValueError(f"{directory} holds no policy.npz") from None
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path} is damaged: {error}") from None
+    if arrays.get("format") != _FORMAT:
+        _refuse(path)
+    return policy
 
 
 def write_atomically(path: Path, content: bytes) -> None:
@@ -252,8 +259,8 @@ def _digests(arrays: dict[str, np.ndarray]) -> dict[str, str]:
 
 def _refuse(path: Path) -> NoReturn:
     raise ValueError(
-        f"{path} was written by an older version of dcc_jax, whose runs cannot be "
-        "resumed; the policy.npz of the run still serves"
+        f"{path} was written by an older version of dcc_jax, which observed something "
+        "else; train it again"
     )
 
 
