@@ -10,8 +10,9 @@ turn in the air counts as a flip, once the character has stood it for that secon
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import flax.struct
 import jax
@@ -50,6 +51,11 @@ class Trampoline(Task):
     clips: ClassVar[tuple[str, ...]] = ("stand", "balance", "jump", "jump_series")
     state_size: ClassVar[int] = 8
     clock: ClassVar[str | None] = "since_bounce"
+    config_overrides: ClassVar[Mapping[str, Any]] = {
+        "ppo.sigma_degrees": 3.0,
+        "env.velocity_time": 0.1,
+    }
+    """docs/skills/trampoline.md compares them."""
 
     interval: float = 3.0
     """Time between two bounces, s (Sec. 5.3)."""
