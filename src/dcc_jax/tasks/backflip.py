@@ -9,8 +9,9 @@ s. The trampoline with the clips `stand jump_high backflip` is the same without 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +31,7 @@ class Backflip(Trampoline):
     clips: ClassVar[tuple[str, ...]] = ("backflip",)
     follows_reference: ClassVar[bool] = True
     start_radius: ClassVar[float] = 0.05
+    config_overrides: ClassVar[Mapping[str, Any]] = {}
 
     interval: float = 100.0
     """Time between two kicks, s: longer than an episode, so the plate kicks once."""
