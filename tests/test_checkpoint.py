@@ -213,6 +213,14 @@ def test_damaged_or_missing_policy_is_one_line(tmp_path):
         checkpoint.load_policy(tmp_path)
 
 
+def test_policy_of_numbers_that_are_not_finite_is_refused(tmp_path):
+    policy = _policy()
+    broken = jax.tree.map(lambda leaf: leaf * np.nan, policy.params)
+    checkpoint.save_policy(tmp_path, policy.replace(params=broken))
+    with pytest.raises(ValueError, match="is damaged: some of its numbers are not"):
+        checkpoint.load_policy(tmp_path)
+
+
 def test_pickled_policy_is_refused(tmp_path):
     np.savez(tmp_path / "policy.npz", payload=np.array([object()]))
     with pytest.raises(ValueError, match="is damaged"):

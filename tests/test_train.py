@@ -39,6 +39,7 @@ def _said(capsys: pytest.CaptureFixture[str], argv: list[str]) -> str:
         ([*SMOKE, "--ppo.learning-rate", "fast"], ["learning-rate", "fast"]),
         ([*SMOKE, "--train.num-envs", "0"], ["num_envs must be 1 or more", "0"]),
         ([*SMOKE, "--env.clips", "/none/a.npz"], ["/none/a.npz"]),
+        ([*SMOKE, "--env.clips", __file__], [__file__, "not a motion", ".bvh"]),
         ([*SMOKE, "--resume"], ["--resume needs --run-dir"]),
         ([*SMOKE, "--ppo.minibatch-size", "100"], ["ppo.minibatch_size", "100"]),
     ],
@@ -84,6 +85,18 @@ def test_resumed_run_cannot_change_its_networks(capsys, tmp_path):
     argv = ["--resume", "--run-dir", str(tmp_path), "--ppo.hidden", "64", "64"]
     line = _said(capsys, argv)
     assert "ppo.hidden is (32, 32)" in line and "(64, 64)" in line
+
+
+def test_policy_without_a_checkpoint_is_not_resumed_and_not_lost(capsys, tmp_path):
+    (tmp_path / "config.json").write_text(
+        config.to_json(config.make_config("push", "smoke"))
+    )
+    (tmp_path / "policy.npz").write_bytes(b"precious")
+    line = _said(capsys, ["--resume", "--run-dir", str(tmp_path)])
+    assert "holds a policy and no checkpoint" in line
+    assert f"--train.start-from {tmp_path}" in line
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["config.json", "policy.npz"]
+    assert (tmp_path / "policy.npz").read_bytes() == b"precious"
 
 
 def test_resumed_run_may_train_longer(tmp_path):

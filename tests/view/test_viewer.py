@@ -223,7 +223,7 @@ def test_pause_is_not_taken_for_a_machine_that_cannot_keep_up(live):
     [
         (["nobody"], ["nobody is not a run directory", "push"]),
         (["push", "--port", "0"], ["--port must be in [1, 65535], got 0"]),
-        (["push", "--alpha", "1.5"], ["--alpha must be in [0, 1), got 1.5"]),
+        (["push", "--alpha", "1.5"], ["--alpha must be in [0, 0.9], got 1.5"]),
         (["push", "--host", "203.0.113.7"], ["host must be", "203.0.113.7"]),
         (["push", "--bogus"], ["--bogus"]),
         (["push", "--task.width", "1"], ["width"]),

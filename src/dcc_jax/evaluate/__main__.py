@@ -93,6 +93,8 @@ def _plan(options: Options) -> command.Work:
         show.check_format(options.figure)
     for path in (options.json, options.figure):
         if path is not None:
+            if path.is_dir():
+                raise ValueError(f"{path} is a directory, not a file to write")
             path.parent.mkdir(parents=True, exist_ok=True)
     if options.drag:
         return _plan_drag(options)

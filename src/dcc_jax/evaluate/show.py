@@ -158,8 +158,8 @@ def _title(report: Report) -> str:
     count = len(report.rows) // len(report.conditions)
     imitation = " and ".join(sorted(set(report.imitation.values())))
     return (
-        f"{report.task}, {imitation}: {count} episodes of {report.seconds:g} s, "
-        f"seed {report.seed}, the same perturbations for all"
+        f"{report.task}, {imitation}: {count} episodes of at most "
+        f"{report.seconds:g} s, seed {report.seed}, the same perturbations for all"
     )
 
 

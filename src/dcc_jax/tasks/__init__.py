@@ -11,6 +11,7 @@ from dcc_jax.env.config import EnvConfig
 from dcc_jax.env.environment import Environment
 from dcc_jax.env.task import Task
 from dcc_jax.motion.clip import Clip, load_clip
+from dcc_jax.motion.formats.npz import MotionError
 from dcc_jax.motion.reference import make_references
 from dcc_jax.motion.retarget.importer import Options, import_motion
 from dcc_jax.motion.retarget.verdict import verdict
@@ -58,7 +59,7 @@ def _clip(name: str) -> Clip:
     """A clip `*.npz`, a motion file that is imported, or one of the package's clips.
 
     Raises:
-        MotionError: a file that cannot be read.
+        MotionError: a file that cannot be read, or is no motion.
         FileNotFoundError: the package has no such clip.
     """
     path = Path(name)
@@ -68,4 +69,7 @@ def _clip(name: str) -> Clip:
         imported = import_motion(path, Options())
         print(f"{name}: imported; {verdict(imported.doubts)}", file=sys.stderr)
         return imported.clip
+    if path.is_file():
+        known = ", ".join((".npz", *MOTION_ENDINGS))
+        raise MotionError(path, f"not a motion: its name ends in none of {known}")
     return load_clip(asset_path(f"motions/{name}.npz"))

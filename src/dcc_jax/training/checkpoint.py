@@ -184,6 +184,8 @@ def load_policy(directory: Path) -> Policy:
         raise ValueError(f"{path} is damaged: {error}") from None
     if arrays.get("format") != _FORMAT:
         _refuse(path)
+    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(policy)):
+        raise ValueError(f"{path} is damaged: some of its numbers are not finite")
     return policy
 
 
@@ -239,7 +241,7 @@ def _read(run_dir: Path, update: int) -> dict[str, np.ndarray]:
     # As in `save`: there is no telling what damage makes it raise.
     except Exception as error:
         reason = str(error).strip().splitlines() or [type(error).__name__]
-        raise CheckpointError(f"orbax cannot read it: {reason[0]}") from error
+        raise CheckpointError(f"orbax cannot read it: {reason[0][:200]}") from error
     names = expected.keys() | actual.keys()
     changed = sorted(k for k in names if expected.get(k) != actual.get(k))
     if changed:

@@ -43,11 +43,17 @@ def check(run_dir: Path, wanted: Config, resume: bool) -> None:
     """Finds out whether a run can begin there, or go on there.
 
     Raises:
-        ValueError: the directory is in use, or what it holds is another run.
+        ValueError: the directory is in use, what it holds is another run, or a policy
+            without the checkpoint that it would go on from.
     """
     if resume:
         _check_whole(run_dir)
         _check_same(config.load(run_dir), wanted, run_dir)
+        if (run_dir / "policy.npz").exists() and not checkpoint.available(run_dir):
+            raise ValueError(
+                f"{run_dir} holds a policy and no checkpoint, so it cannot be resumed; "
+                f"--train.start-from {run_dir} begins a new run with the policy"
+            )
     elif run_dir.exists() and (not run_dir.is_dir() or any(run_dir.iterdir())):
         raise ValueError(
             f"run_dir {run_dir} exists and is not empty; resume continues a run"

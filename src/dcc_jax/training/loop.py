@@ -182,6 +182,8 @@ def _prepared(
         state = _restored(run, template, say)
         compiled = _lowered(run, template).compile()
     else:
+        if run.resume:
+            say(f"no checkpoint in {run.run_dir}: it begins with the first update")
         lowered = init.lower(key, None)  # pyright: ignore[reportFunctionMemberAccess]
         with ThreadPoolExecutor(1) as beside:
             made = beside.submit(lambda: lowered.compile()(key, None))
@@ -250,7 +252,7 @@ def _finish(
             f"continue with --resume --run-dir {run.run_dir}"
         )
     else:
-        say(f"finished after update {done}: {run.run_dir}")
+        say(f"finished after update {done}; watch it: dcc-jax view {run.run_dir}")
     metrics = logs.read(run.run_dir)
     if said := verdict(metrics):
         say(said)

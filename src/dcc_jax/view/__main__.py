@@ -58,8 +58,6 @@ class Options:
     task: overrides.TaskParameters = ()
 
     def __post_init__(self) -> None:
-        if self.alpha is not None and not 0.0 <= self.alpha < 1.0:
-            raise ValueError(f"--alpha must be in [0, 1), got {self.alpha}")
         if not 0 <= self.seed < 2**32:
             raise ValueError(f"--seed must be in [0, 2^32 - 1], got {self.seed}")
         if not 1 <= self.port <= 65535:
@@ -85,6 +83,8 @@ def _plan(options: Options) -> command.Work:
     known = runs.known_runs()
     name = options.run_dir or (FIRST if FIRST in known else known[0])
     run = runs.find_run(name)
+    if options.alpha is not None:
+        run.config.env.compliance.check_alpha(options.alpha, "--alpha")
     task = overrides.changes(PROGRAM, name, options.task)
     return partial(_serve, options, run.name, known, port, task)
 
