@@ -30,6 +30,7 @@ from dcc_jax.tasks.push import Push
 command = importlib.import_module("dcc_jax.evaluate.__main__")
 
 pytestmark = pytest.mark.xdist_group("push")
+FIRST_ROWS = "fell", "survived (s)", "task/speed/mean", "contact/peak (N)"
 EPISODES, SECONDS, GRAVITY = 8, 1.5, 9.81
 Seen = tuple[Player, Recording, report.Report]
 
@@ -245,6 +246,9 @@ def test_json_and_figure_are_written_and_the_table_is_printed(
         assert text.count(part) == 1
     assert text.count("contact/peak (N)") == text.count("survived (s)") == 2
     assert text.count("contact/peak_max (N)") == 1
+    lines = text.splitlines()
+    rows = [next(i for i, x in enumerate(lines) if n in x) for n in FIRST_ROWS]
+    assert rows == sorted(rows)
     data = json.loads(paths["a.json"].read_text(), parse_constant=pytest.fail)
     assert [row["u_on"] for row in data["rows"]].count(False) == EPISODES
     assert data["summary"][0]["fell"].keys() == {"value", "low", "high"}

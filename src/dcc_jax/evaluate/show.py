@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -45,14 +46,20 @@ def table(report: Report) -> Group:
         "paired ratios of means, or differences [95 % interval]",
         [_versus(report, comparison) for comparison in report.comparisons],
     )
-    for name in report.summary[0]:
+    for name in _ordered(report.summary[0]):
         means.add_row(_row_name(name), *[_text(s[name]) for s in report.summary])
-    for name in report.rows[0] if report.comparisons else ():
+    for name in _ordered(report.rows[0]) if report.comparisons else ():
         if name in report.comparisons[0].ratio:
             compared.add_row(
                 _row_name(name), *[_compared(c, name) for c in report.comparisons]
             )
     return Group(means, compared) if report.comparisons else Group(means)
+
+
+def _ordered(metrics: Iterable[str]) -> list[str]:
+    """Who falls, then the task's own metrics, then all others."""
+    first = "fell", "survived"
+    return sorted(metrics, key=lambda m: (m not in first, not m.startswith("task/")))
 
 
 def _table(title: str, columns: list[str]) -> Table:
