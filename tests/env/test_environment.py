@@ -13,6 +13,7 @@ import pytest
 from dcc_jax import quat
 from dcc_jax.character import CONTROL_DT, Character, asset_path
 from dcc_jax.control import pd
+from dcc_jax.control.controller import Displacement
 from dcc_jax.env.config import EnvConfig
 from dcc_jax.env.environment import Environment
 from dcc_jax.env.observation import ALPHA_ENTRY
@@ -167,16 +168,19 @@ def test_alpha_is_drawn_from_its_range_and_observed(environment):
     np.testing.assert_array_equal(states.obs[:, ALPHA_ENTRY], alpha)
 
 
+@pytest.mark.parametrize("pd_yields", [True, False])
 def test_the_discriminator_sees_a_pose_without_all_that_forces_made_it_yield(
-    environment, start
+    environment, start, pd_yields, monkeypatch
 ):
-    """Also what PD gives way by, of which u is a share alone (Eq. (6))."""
+    """Also what PD gives way by, of which u is a share alone (Eq. (6)), if it does."""
+    monkeypatch.setattr(type(environment.task), "pd_yields", pd_yields)
     rng = np.random.default_rng(0)
     coords, scene = environment.kinematics.coords, environment.scene
     y = 0.2 * rng.normal(size=coords.nv).astype(np.float32)
     y[[2, 3, 4, 5]] = 0.0  # what of the root is not displaced
     whole = quat.exp_map(coords, jnp.asarray(y))
     u = quat.exp_map(coords, jnp.asarray(0.5 * y))
+    gone = whole if pd_yields else u
 
     def observed(u, y, away):
         q = scene.character_qpos(start.body.qpos)
@@ -190,13 +194,14 @@ def test_the_discriminator_sees_a_pose_without_all_that_forces_made_it_yield(
                 q_previous=quat.oplus(coords, start.q_previous, away),
                 displacement=dataclasses.replace(start.displacement, u=u, y=y),
                 u_previous=u,
-                yield_previous=quat.exp_map(coords, y),
+                yield_previous=environment.yielded(Displacement(u=u, ud=y, y=y, yd=y)),
             )
         )
 
     rest = quat.identity(coords)
     at_rest = observed(rest, jnp.zeros(coords.nv), rest)
-    yielded = observed(u, jnp.asarray(y), whole)
+    yielded = observed(u, jnp.asarray(y), gone)
     np.testing.assert_allclose(yielded.features, at_rest.features, atol=2e-5)
     # The policy's own numbers have u taken off, as in the paper.
-    assert np.abs(yielded.obs[:270] - at_rest.obs[:270]).max() > 0.01
+    apart = np.abs(yielded.obs[:270] - at_rest.obs[:270]).max()
+    assert apart > 0.01 if pd_yields else apart < 1e-3

@@ -201,14 +201,14 @@ class Environment:
             reference=inputs.reference,
             q_previous=self.scene.character_qpos(state.body.qpos),
             u_previous=state.displacement.u,
-            yield_previous=compliance.whole_yield(self.controller, state.displacement),
+            yield_previous=self.yielded(state.displacement),
             previous_features=state.features,
             metrics=metrics.metrics(
                 end.sums,
                 self.config.control_steps,
                 self.kinematics.coords,
                 end.displacement.u,
-                compliance.whole_yield(self.controller, end.displacement),
+                self.yielded(end.displacement),
                 inputs.room,
             ),
         )
@@ -268,14 +268,20 @@ class Environment:
         coords = self.kinematics.coords
         return quat.oplus(coords, pose, quat.exp_map(coords, tangent))
 
-    def observed(self, state: EnvState) -> EnvState:
-        """Fills in the features and the observation.
+    def yielded(self, displacement: compliance.Displacement) -> Array:
+        """Where forces have the pose, relative to where clips have it [55].
 
-        Departure: from what the discriminator sees, the paper takes u off. Here
-        `compliance.whole_yield` goes, as in `outcome.tracking`: of a pose that has u
-        alone taken off, what PD gives way by is no part of any clip, and a policy that
-        works against it would be paid.
+        Both rewards take it off before they compare a pose with clips.
+        Departure: the paper takes u off. Of a pose without u alone, what PD gives way
+        by is no part of any clip, and a policy that works against it would be paid: it
+        made the hands twice as stiff as Eq. (7) says (`evaluate --drag`).
         """
+        if self.task.pd_yields:
+            return compliance.whole_yield(self.controller, displacement)
+        return displacement.u
+
+    def observed(self, state: EnvState) -> EnvState:
+        """Fills in the features and the observation."""
         obs = observation.observation(
             self.task,
             self.scene,
@@ -288,7 +294,7 @@ class Environment:
             self.kinematics,
             self.scene.character_qpos(state.body.qpos),
             state.q_previous,
-            compliance.whole_yield(self.controller, state.displacement),
+            self.yielded(state.displacement),
             state.yield_previous,
         )
         seen = pairs.weighed(bodies, self.config.velocity_time)
@@ -315,7 +321,7 @@ class Environment:
             r_q = outcome.tracking(
                 self.kinematics,
                 q,
-                compliance.whole_yield(self.controller, state.displacement),
+                self.yielded(state.displacement),
                 state.reference.qpos,
                 config.reward,
             )

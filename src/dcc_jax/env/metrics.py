@@ -102,7 +102,7 @@ def metrics(
         steps: how many they are.
         coords: of the character.
         u: displacement [55] at its end.
-        yielded: the whole yield [55], `compliance.whole_yield`.
+        yielded: `Environment.yielded` [55].
         room: what the reference leaves of the joint ranges.
     """
     contact = jnp.maximum(sums.contact_steps, 1.0)

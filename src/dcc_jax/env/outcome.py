@@ -55,12 +55,7 @@ def tracking(
     reference: Array,
     config: RewardConfig,
 ) -> Array:
-    """How well q (-) yielded follows the reference [55] in time (Appendix), [].
-
-    Departure: the paper takes u off, where `compliance.whole_yield` also has what PD
-    gives way by. Without that a policy is rewarded for working against the yield: it
-    made the hands twice as stiff as Eq. (7) says (`evaluate --drag`).
-    """
+    """How well q (-) yielded follows the reference [55] in time (Appendix), []."""
     coords = kinematics.coords
     _, here = coords.split_q(quat.ominus(coords, q, yielded))
     _, there = coords.split_q(reference)

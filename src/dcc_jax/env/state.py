@@ -37,7 +37,7 @@ class EnvState:
     body: physics.State
     displacement: Displacement  # of the character
     u_previous: Array  # [55] one control step ago
-    yield_previous: Array  # [55] `compliance.whole_yield` then
+    yield_previous: Array  # [55] `Environment.yielded` then
     q_previous: Array  # [55] the character's coordinates then
     start: RootTarget  # of the reference, at the reset
     reference: RefState  # now, where the clip is followed in time; else at the reset

@@ -55,6 +55,7 @@ class Ball(Task):
     clips: ClassVar[tuple[str, ...]] = ("stand",)
     has_reward: ClassVar[bool] = True
     follows_reference: ClassVar[bool] = True
+    pd_yields: ClassVar[bool] = False
     extra_actions: ClassVar[int] = 6
     state_size: ClassVar[int] = 12
     config_overrides: ClassVar[Mapping[str, Any]] = {

@@ -51,6 +51,7 @@ class Trampoline(Task):
     clips: ClassVar[tuple[str, ...]] = ("stand", "balance", "jump", "jump_series")
     state_size: ClassVar[int] = 8
     clock: ClassVar[str | None] = "since_bounce"
+    pd_yields: ClassVar[bool] = False
     config_overrides: ClassVar[Mapping[str, Any]] = {
         "ppo.sigma_degrees": 3.0,
         "env.velocity_time": 0.1,
