@@ -48,7 +48,7 @@ IN_CONTACT = (
     Line("contact/torque", "RMS torque during contact (N m)", 1.0, 2),
 )
 U = (
-    Line("u/joints_max", "largest u of the joints (mrad)", 1e3),
+    Line("u/joints_max", "largest u, all joints together (mrad)", 1e3),
     Line("u/root_max", "largest u of the root (mm)", 1e3),
 )
 PATH = Line("task/path_distance/mean", "distance to the path, mean (mm)", 1e3)

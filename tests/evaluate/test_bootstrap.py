@@ -77,12 +77,24 @@ def test_share_of_what_was_never_seen_is_not_certain():
     assert [half.low, half.high] == pytest.approx([0.4038, 0.5962], abs=1e-4)
 
 
+def test_share_of_trials_is_less_certain_where_episodes_decide():
+    rng = np.random.default_rng(3)
+    good, episode = rng.random(40) < 0.5, np.repeat(np.arange(40), 10)
+    resamples = bootstrap.draws(40)
+    whole = bootstrap.share_of(good[episode], episode, resamples)
+    assert whole.value == pytest.approx(good.mean())
+    brute = good[resamples].mean(axis=1)  # all episodes are as long
+    assert [whole.low, whole.high] == pytest.approx(np.percentile(brute, [2.5, 97.5]))
+    alone = bootstrap.share(good[episode])
+    assert whole.high - whole.low > 2.0 * (alone.high - alone.low)
+
+
 def test_quantile_resamples_whole_episodes():
     rng = np.random.default_rng(2)
     values, episode = rng.normal(size=400), np.repeat(np.arange(40), 10)
     resamples = bootstrap.draws(40)
     found = bootstrap.quantile(values, episode, 0.9, resamples)
-    assert found.value == pytest.approx(np.quantile(values, 0.9))
+    assert found.value == np.sort(values)[359]
     brute = [
         np.sort(np.concatenate([values[episode == e] for e in row]))[359]
         for row in resamples[:200]

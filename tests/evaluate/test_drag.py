@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from dcc_jax.character import asset_path, compose_scene, load_character
+from dcc_jax.config import make_config
 from dcc_jax.control.stiffness import softened_gains, stiffness
 from dcc_jax.evaluate import drag, rest, show_drag
 from dcc_jax.evaluate.dragging import BODIES, DIRECTIONS, NEWTONS, Trials
@@ -153,6 +154,15 @@ def test_a_trial_that_falls_at_one_level_counts_for_the_slope_at_none():
     drags[1].measured[fallen] = np.nan
     drags[0].measured[fallen] = 1e-3
     assert drag.slope(drags, "left_hand") == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_law_without_a_static_stiffness_is_refused():
+    config = make_config("push", "smoke").with_(
+        {"env.compliance.law": "algorithm_1", "env.alpha": 0.0}
+    )
+    run = SimpleNamespace(config=config, alphas=(0.0, 0.1))
+    with pytest.raises(ValueError, match="'admittance', and the law is 'algorithm_1'"):
+        drag.prepare(run, None, 1, 0, None)
 
 
 def test_small_yields_can_be_left_out():

@@ -199,10 +199,11 @@ def yield_at_rest(
 def greatest_alpha(
     controller: Controller, q_m: Array, J: Array, forces: Array
 ) -> Array:
-    """The level [] up to which `admittance` yields to constant forces in full.
+    """The level [] up to which the joints yield to constant forces in full.
 
-    Beyond it some joint would use more than `ranges.LINEAR_SHARE` of its room, and the
-    yield is shortened. 0 where PD alone does.
+    That is of `admittance`. Beyond it some joint would use more than
+    `ranges.LINEAR_SHARE` of its room, and its yield is shortened. 0 where PD alone
+    does.
 
     Args:
         controller: of the character, with joint ranges.
@@ -218,7 +219,7 @@ def greatest_alpha(
     # = n.
     farther = ranges.LINEAR_SHARE / ranges.used(controller.coords, room, alone)
     W = jnp.asarray(controller.weights, J.dtype)[controller.coords.quat_dof[1:, 0]]
-    odds = jnp.min(jnp.maximum(farther - 1.0, 0.0) / W)
+    odds = jnp.min(jnp.where(W > 0.0, jnp.maximum(farther - 1.0, 0.0) / W, jnp.inf))
     return jnp.minimum(1.0 - 1.0 / (1.0 + odds), controller.config.greatest_alpha)
 
 

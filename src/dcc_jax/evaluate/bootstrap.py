@@ -76,7 +76,21 @@ def quantile(
     times = np.stack([np.bincount(row, minlength=count) for row in resamples])
     reached = np.cumsum(times[:, episode], axis=1)
     at = (reached >= q * reached[:, -1:]).argmax(axis=1)
-    return _interval(float(np.quantile(values, q)), values[at])
+    value = np.quantile(values, q, method="inverted_cdf")  # as in the resamples
+    return _interval(float(value), values[at])
+
+
+def share_of(
+    values: np.ndarray, episode: np.ndarray, resamples: np.ndarray
+) -> Interval:
+    """Share of true values [K] of episodes [K]; whole episodes are resampled."""
+    if len(values) == 0:
+        return _interval(np.nan, np.full(2, np.nan))
+    count = resamples.shape[1]
+    true = np.bincount(episode, values, count)[resamples].sum(axis=1)
+    every = np.bincount(episode, minlength=count)[resamples].sum(axis=1)
+    with np.errstate(invalid="ignore"):
+        return _interval(float(np.mean(values)), true / every)
 
 
 def _paired(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,6 +1,6 @@
 """The stiffness that a moving character has at its hands, chest and head.
 
-A force ramps up at a body, holds and lets go, while the trained policy balances and
+A force ramps up at a body and holds, while the trained policy balances and
 walks. The yield is how far the body's centre of mass moves relative to the pelvis, in
 the pelvis's frame, against the same episode without the force. It is compared with what
 Eq. (7) has at the poses of that episode, see `rest`.
@@ -57,23 +57,24 @@ class Drag:
     def share_near(self, body: str, least: float = 0.0) -> Interval:
         """Of the trials at a body, as of `at`, those within `NEAR` of theory."""
         at = self.at(body, least)
-        if not len(at):
-            return Interval(np.nan, np.nan, np.nan)
-        return bootstrap.share(np.abs(self.measured[at] / self.theory[at] - 1.0) < NEAR)
+        near = np.abs(self.measured[at] / self.theory[at] - 1.0) < NEAR
+        return bootstrap.share_of(near, self.episode[at], self._resamples())
 
     def stiffness(self, body: str) -> Interval:
         """Median of the measured stiffness at a body, N/m."""
         at = self.at(body)
-        if not len(at):
-            return Interval(np.nan, np.nan, np.nan)
-        again = self.measured[at][bootstrap.draws(len(at))]
-        low, high = np.percentile(np.median(again, axis=1), [2.5, 97.5])
-        return Interval(float(np.median(self.measured[at])), float(low), float(high))
+        return bootstrap.quantile(
+            self.measured[at], self.episode[at], 0.5, self._resamples()
+        )
 
     def expected(self, body: str) -> float:
         """Median of the theoretical stiffness over the same trials, N/m."""
         at = self.at(body)
         return float(np.median(self.theory[at])) if len(at) else np.nan
+
+    def _resamples(self) -> np.ndarray:
+        """Of whole episodes: the trials of one share its motion."""
+        return bootstrap.draws(int(self.episode.max()) + 1)
 
 
 @dataclass(frozen=True)
@@ -120,6 +121,11 @@ def prepare(
     """Checks everything a user can get wrong; arguments as of `drag`."""
     if episodes < 1:
         raise ValueError(f"episodes must be 1 or more, got {episodes}")
+    law = run.config.env.compliance.law
+    if law != "admittance":
+        raise ValueError(
+            f"a drag's theory is that of 'admittance', and the law is {law!r}"
+        )
     low, high = run.alphas
     levels = [x for x in LEVELS if low <= x <= high] if alpha is None else list(alpha)
     for level in levels:
@@ -193,7 +199,7 @@ def _expected(
     alpha: float,
 ) -> np.ndarray:
     """Yields along the force [K], m, that theory has: the mean over poses q [T, K, 55]
-    under forces [T, K, 3] in the pelvis's frame. Every fifth: a stride has a dozen."""
+    under forces [T, K, 3] in the pelvis's frame. Every fifth: six of the second."""
     q, force = q[::5], force[::5]
     times = len(q)
     moved = rest.yields_at_rest(

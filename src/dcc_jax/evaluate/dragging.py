@@ -1,6 +1,6 @@
 """Episodes in which a force drags at the character's body, as one compiled program.
 
-The force ramps up, holds and lets go, while the policy's mean action goes on.
+The force ramps up and holds, while the policy's mean action goes on.
 Letters: K trials, T control steps.
 """
 

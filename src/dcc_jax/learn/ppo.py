@@ -27,7 +27,7 @@ class PpoConfig:
 
     activation: networks.Activation = "relu"
     """Between the layers of both networks; the paper does not say. ReLUs may die, but
-    ELUs learned `hand-in-hand` more slowly (docs/results.md)."""
+    ELUs learned `hand-in-hand` more slowly (docs/skills/hand-in-hand.md)."""
 
     sigma_degrees: float = 6.0
     """Standard deviation of every action (Sec. 5.1)."""

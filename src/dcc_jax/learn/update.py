@@ -41,7 +41,7 @@ Array = jax.Array
 VALUE_FIRST = 50
 """Updates in which a policy that is not new waits for its value function."""
 
-# Environments whose working set stays in the cache of a core (design, section 2.5).
+# Environments whose working set stays in the cache of a core.
 _CPU_CHUNK = 128
 
 

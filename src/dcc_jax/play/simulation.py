@@ -142,12 +142,6 @@ class Simulation:
         spring = stiffness, PULL_DAMPING * stiffness if damping is None else damping
         self._hold(PULL, body, point, target_w, *spring, np.zeros(3))
 
-    def move_pull(self, target_w: np.ndarray) -> None:
-        """The other end of the spring [3] is elsewhere."""
-        targets = self.hands.target_w.copy()
-        targets[PULL] = _finite("target_w", target_w)
-        self.hands = dataclasses.replace(self.hands, target_w=targets)
-
     def release(self) -> None:
         """Lets go of the spring."""
         self._hold(PULL, None, np.zeros(3), np.zeros(3), 0.0, 0.0, np.zeros(3))

@@ -42,6 +42,10 @@ class Backflip(Trampoline):
     kick_spread: float = 0.03
     """How much earlier or later the kick may come, s; the policy observes when."""
 
+    def quiet(self) -> Backflip:
+        """The kick is part of the flip."""
+        return self
+
     def reset(
         self, key: Array, scene: physics.Scene, reference: RefState
     ) -> tuple[TrampolineState, Array, Array]:

@@ -91,8 +91,9 @@ class Ball(Task):
     head_force: float = 1000.0
     """Fictional force at the head for an action of 1, N; 0 takes it away."""
     root_force: float = 5000.0
-    """The same at the root, N. At alpha 0.16 it takes the root's target 0.48 m away, at
-    up to 1.3 m/s; the authors' early code has 1.46 m/s."""
+    """The same at the root, N. At alpha 0.16 it takes the root's target 0.41 m away, at
+    up to 1.2 m/s, at 0.3 0.52 m, at 1.5 m/s (`control.ranges.ROOT_ROOM` bounds it); the
+    authors' early code has 1.46 m/s."""
 
     def __post_init__(self) -> None:
         positive = ("pole_length", "pole_mass", "ball_radius", "ball_mass", "interval")
@@ -104,6 +105,10 @@ class Ball(Task):
             value = getattr(self, name)
             if not 0.0 <= value < math.inf:
                 raise ValueError(f"task.{name} must be 0 or more, got {value}")
+
+    def quiet(self) -> Ball:
+        """Nobody pushes the ball."""
+        return dataclasses.replace(self, interval=1e9)
 
     def extend(self, spec: mujoco.MjSpec) -> None:
         """Pole and ball, and the ball joint that stands them on the crown."""

@@ -101,6 +101,10 @@ class ChickenFight(Task):
     brake_time: float = 0.2
     """Time constant of the box's braking, s."""
 
+    def quiet(self) -> ChickenFight:
+        """Nobody attacks."""
+        return dataclasses.replace(self, interval=1e9)
+
     def extend(self, spec: mujoco.MjSpec) -> None:
         """A box as heavy as the character that touches its trunk and arms."""
         mass = sum(geom.mass for geom in spec.geoms if math.isfinite(geom.mass))
