@@ -205,3 +205,11 @@ def test_the_discriminator_sees_a_pose_without_all_that_forces_made_it_yield(
     # The policy's own numbers have u taken off, as in the paper.
     apart = np.abs(yielded.obs[:270] - at_rest.obs[:270]).max()
     assert apart > 0.01 if pd_yields else apart < 1e-3
+
+
+def test_task_that_observes_another_number_of_numbers_is_told(
+    environment, start, monkeypatch
+):
+    monkeypatch.setattr(Push, "state_size", 7)
+    with pytest.raises(ValueError, match=r"Push\.observe gives \[6\] numbers, its st"):
+        environment.observed(start)

@@ -45,11 +45,20 @@ def observation(
         state: now.
         target: the reference's root now.
         has_phase: whether the reference's phase is in it.
+
+    Raises:
+        ValueError: the task observes another number of numbers than its `state_size`.
     """
     q = scene.character_qpos(state.body.qpos)
     numbers = features.state(
         kinematics, q, state.q_previous, state.displacement.u, state.u_previous
     )
+    seen = task.observe(scene, state.task, state.body)
+    if seen.shape != (task.state_size,):
+        raise ValueError(
+            f"{type(task).__name__}.observe gives {list(seen.shape)} numbers, its "
+            f"state_size is {task.state_size}"
+        )
     offset = target.position + state.displacement.u[:2] - q[:2]
     parts = [
         numbers,
@@ -57,7 +66,7 @@ def observation(
         _seen_from(q, target.velocity),
         state.alpha[None],
         of_phase(state.reference.phase) if has_phase else jnp.zeros(0),
-        task.observe(scene, state.task, state.body),
+        seen,
     ]
     return jnp.concatenate(parts)
 

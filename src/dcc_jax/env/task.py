@@ -170,8 +170,17 @@ class Task:
         solution: physics.Solution,
         action: Array,
     ) -> tuple[Any, Forces]:
-        """The forces of a substep for the compliance controller; may note events."""
-        raise NotImplementedError
+        """The forces of a substep for the compliance controller; may note events.
+
+        Here: none, one row of zeros at the root.
+        """
+        root = scene.body(scene.character.body_names[0])
+        return state, Forces(
+            force_w=jnp.zeros((1, 3)),
+            point_w=kin.body_center[root][None],
+            body=jnp.array([root], jnp.int32),
+            gate=jnp.zeros((), bool),
+        )
 
     def observe(self, scene: physics.Scene, state: Any, body: physics.State) -> Array:
         """s_task [S], in the character's local frame."""

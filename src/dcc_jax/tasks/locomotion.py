@@ -20,7 +20,7 @@ import jax.numpy as jnp
 
 from dcc_jax import physics, quat
 from dcc_jax.env import features
-from dcc_jax.env.task import Forces, RootTarget, Task, place_character
+from dcc_jax.env.task import RootTarget, Task, place_character
 from dcc_jax.motion import paths, planner
 from dcc_jax.motion.paths import Gaits, Motion
 from dcc_jax.motion.reference import RefState
@@ -95,23 +95,6 @@ class Locomotion(Task):
         """On the path."""
         root, heading, speed = paths.path(state.motion, time)
         return RootTarget(root, speed * paths.direction(heading))
-
-    def forces(
-        self,
-        scene: physics.Scene,
-        state: LocomotionState,
-        kin: physics.Kinematics,
-        solution: physics.Solution,
-        action: Array,
-    ) -> tuple[LocomotionState, Forces]:
-        """None: one row of zeros."""
-        root = scene.body(scene.character.body_names[0])
-        return state, Forces(
-            force_w=jnp.zeros((1, 3)),
-            point_w=kin.body_center[root][None],
-            body=jnp.array([root], jnp.int32),
-            gate=jnp.zeros((), bool),
-        )
 
     def observe(
         self, scene: physics.Scene, state: LocomotionState, body: physics.State
