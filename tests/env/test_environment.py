@@ -213,3 +213,20 @@ def test_task_that_observes_another_number_of_numbers_is_told(
     monkeypatch.setattr(Push, "state_size", 7)
     with pytest.raises(ValueError, match=r"Push\.observe gives \[6\] numbers, its st"):
         environment.observed(start)
+
+
+def test_discriminator_sees_heights_above_what_the_character_stands_on(
+    environment, start, monkeypatch
+):
+    height = environment.scene.qpos_adr + 2
+    up = dataclasses.replace(
+        start,
+        body=dataclasses.replace(start.body, qpos=start.body.qpos.at[height].add(0.3)),
+        q_previous=start.q_previous.at[2].add(0.1),
+        ground_previous=jnp.float32(0.1),
+    )
+    monkeypatch.setattr(Push, "ground_height", lambda *_: jnp.float32(0.3))
+    seen = environment.observed(up)
+    np.testing.assert_allclose(seen.features, start.features, atol=1e-4)
+    # The policy sees where it is in the world.
+    assert np.abs(seen.obs[:270] - start.obs[:270]).max() > 0.29

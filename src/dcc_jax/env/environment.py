@@ -124,6 +124,7 @@ class Environment:
             body=body,
             displacement=displacement,
             u_previous=displacement.u,
+            ground_previous=zero,
             yield_previous=displacement.u,
             q_previous=start.qpos_previous,
             start=RootTarget(start.qpos[:2], start.travel),
@@ -132,6 +133,7 @@ class Environment:
             time=zero,
             task=task,
         )
+        state = dataclasses.replace(state, ground_previous=self._ground(state))
         return self.observed(state)
 
     def step(self, key: Array, state: EnvState, action: Array) -> EnvState:
@@ -201,6 +203,7 @@ class Environment:
             reference=inputs.reference,
             q_previous=self.scene.character_qpos(state.body.qpos),
             u_previous=state.displacement.u,
+            ground_previous=self._ground(state),
             yield_previous=self.yielded(state.displacement),
             previous_features=state.features,
             metrics=metrics.metrics(
@@ -281,7 +284,11 @@ class Environment:
         return displacement.u
 
     def observed(self, state: EnvState) -> EnvState:
-        """Fills in the features and the observation."""
+        """Fills in the features and the observation.
+
+        Departure: heights that the discriminator sees are above what the character
+        stands on, which in clips is the floor.
+        """
         obs = observation.observation(
             self.task,
             self.scene,
@@ -292,8 +299,8 @@ class Environment:
         )
         bodies = features.unyielded(
             self.kinematics,
-            self.scene.character_qpos(state.body.qpos),
-            state.q_previous,
+            self.scene.character_qpos(state.body.qpos).at[2].add(-self._ground(state)),
+            state.q_previous.at[2].add(-state.ground_previous),
             self.yielded(state.displacement),
             state.yield_previous,
         )
@@ -309,13 +316,16 @@ class Environment:
             previous_features=jnp.where(first, seen, state.previous_features),
         )
 
+    def _ground(self, state: EnvState) -> Array:
+        return self.task.ground_height(self.scene, state.task, state.body)
+
     def _judged(self, state: EnvState) -> EnvState:
         """Fills in rewards and endings."""
         scene, task, config = self.scene, self.task, self.config
         q = scene.character_qpos(state.body.qpos)
         qd = scene.character_qvel(state.body.qvel)
         target = self._root_target(state)
-        ground = task.ground_height(scene, state.task, state.body)
+        ground = self._ground(state)
         r_q, over = jnp.zeros(()), state.time >= config.episode_seconds - 1e-4
         if self.tracks_reference:
             r_q = outcome.tracking(

@@ -37,6 +37,7 @@ class EnvState:
     body: physics.State
     displacement: Displacement  # of the character
     u_previous: Array  # [55] one control step ago
+    ground_previous: Array  # [] m, height of what it stood on then
     yield_previous: Array  # [55] `Environment.yielded` then
     q_previous: Array  # [55] the character's coordinates then
     start: RootTarget  # of the reference, at the reset
