@@ -13,6 +13,7 @@ from dcc_jax.tasks import TASKS, make_environment, make_task
 from dcc_jax.tasks.backflip import Backflip
 from dcc_jax.tasks.push import Push, PushState
 from dcc_jax.tasks.sustained_push import SustainedPush
+from dcc_jax.tasks.trampoline import Trampoline
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -33,7 +34,7 @@ def test_what_a_task_offers_changes_numbers_of_its_state(name):
 
 def test_what_has_a_schedule_waits_and_what_has_begun_goes_on():
     task = Push()
-    assert actions.has_events(task) and actions.has_events(Backflip())
+    assert task.event is not None and Backflip().event == Trampoline().event
     later = actions.waiting(task, PushState(np.float32(0.4)))
     assert later.next_throw == pytest.approx(task.interval)
     begun = PushState(np.float32(-0.02))
@@ -47,5 +48,5 @@ def test_leader_goes_where_it_is_told_and_wants_nothing_else():
 
 
 def test_door_has_a_width():
-    assert set(actions.parameters(make_task("door"))) == {"width"}
-    assert not actions.parameters(make_task("push"))
+    assert set(make_task("door").adjustable) == {"width"}
+    assert not make_task("push").adjustable

@@ -34,6 +34,14 @@ class Forces:
     gate: Array  # [] bool; False: none of them is passed to the controller
 
 
+@dataclass(frozen=True)
+class Event:
+    """What happens by itself now and then. In the viewer it waits, or comes at once."""
+
+    name: str  # of the viewer's button
+    countdown: str  # field of the task's state: s until it happens
+
+
 @flax.struct.dataclass
 class RootTarget:
     """Where the reference's root is over the ground, and how fast it moves."""
@@ -79,6 +87,10 @@ class Task:
     clock: ClassVar[str | None] = None
     """The entry of `evaluate`, in s since an event (a throw, a landing), over which an
     evaluation draws its curves; None: over the time since the reset."""
+    event: ClassVar[Event | None] = None
+    """What the task lets happen by itself, where a person may have it happen."""
+    adjustable: ClassVar[Mapping[str, tuple[float, float]]] = {}
+    """Parameters that the viewer can change, and their ranges."""
     config_overrides: ClassVar[Mapping[str, Any]] = {}
     """What it learns with, by dotted name as on the command line, where the presets
     `cpu` and `gpu` would say otherwise: `{"ppo.sigma_degrees": 3.0}`."""

@@ -26,7 +26,7 @@ import mujoco
 from dcc_jax import draws, physics, quat
 from dcc_jax.character import CONTROL_DT, CONTROL_RATE
 from dcc_jax.env import features
-from dcc_jax.env.task import Forces, Task, place_character
+from dcc_jax.env.task import Event, Forces, Task, place_character
 from dcc_jax.motion.reference import RefState
 
 Array = jax.Array
@@ -58,6 +58,7 @@ class Ball(Task):
     pd_yields: ClassVar[bool] = False
     extra_actions: ClassVar[int] = 6
     state_size: ClassVar[int] = 12
+    event: ClassVar[Event | None] = Event("nudge the ball", "next_push")
     config_overrides: ClassVar[Mapping[str, Any]] = {
         "ppo.sigma_degrees": 3.0,
         "train.warm_start_steps": 0,

@@ -28,7 +28,7 @@ import numpy as np
 from dcc_jax import draws, physics, quat
 from dcc_jax.character import CONTROL_DT, add_contact
 from dcc_jax.env import features
-from dcc_jax.env.task import Forces, Task, place_character, resultant
+from dcc_jax.env.task import Event, Forces, Task, place_character, resultant
 from dcc_jax.motion import paths
 from dcc_jax.motion.paths import Gaits, Motion
 from dcc_jax.motion.reference import References, RefState, planar_moved
@@ -73,6 +73,7 @@ class ChickenFight(Task):
     clips: ClassVar[tuple[str, ...]] = ("hop_in_place",)
     follows_reference: ClassVar[bool] = True
     state_size: ClassVar[int] = 4
+    event: ClassVar[Event | None] = Event("send the box", "next_attack")
     clock: ClassVar[str | None] = "since_bump"
     config_overrides: ClassVar[Mapping[str, Any]] = {
         "ppo.sigma_degrees": 3.0,

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -68,6 +69,7 @@ class Door(Task):
     follows_reference: ClassVar[bool] = True
     start_radius: ClassVar[float] = 0.02
     state_size: ClassVar[int] = 7
+    adjustable: ClassVar[Mapping[str, tuple[float, float]]] = {"width": (0.8, 1.8)}
     camera_azimuth: ClassVar[float] = 20.0  # the door hides what is behind it
 
     width: float = 1.0

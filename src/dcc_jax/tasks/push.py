@@ -20,7 +20,7 @@ import numpy as np
 
 from dcc_jax import draws, physics
 from dcc_jax.character import CONTROL_DT, GRAVITY, add_contact
-from dcc_jax.env.task import Forces, Task, place_character
+from dcc_jax.env.task import Event, Forces, Task, place_character
 from dcc_jax.motion.reference import RefState
 
 Array = jax.Array
@@ -49,6 +49,7 @@ class Push(Task):
         *(f"recover_{angle:03d}" for angle in range(0, 360, 45)),
     )
     state_size: ClassVar[int] = 6
+    event: ClassVar[Event | None] = Event("throw a ball", "next_throw")
     clock: ClassVar[str | None] = "since_throw"
 
     interval: float = 1.5

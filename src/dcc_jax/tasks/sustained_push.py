@@ -21,7 +21,7 @@ import jax.numpy as jnp
 
 from dcc_jax import draws, physics
 from dcc_jax.character import CONTROL_DT
-from dcc_jax.env.task import Forces, Task, place_character
+from dcc_jax.env.task import Event, Forces, Task, place_character
 from dcc_jax.motion import paths, planner
 from dcc_jax.motion.paths import Gaits, Motion
 from dcc_jax.motion.reference import References, RefState
@@ -51,6 +51,7 @@ class SustainedPush(Task):
     tracks: ClassVar[bool] = False
     conditions_on_phase: ClassVar[bool] = False
     state_size: ClassVar[int] = locomotion.SEEN
+    event: ClassVar[Event | None] = Event("next push or pause", "left")
     clock: ClassVar[str | None] = "since_push"
 
     gaits: Gaits = field(default_factory=Gaits)

@@ -22,7 +22,7 @@ import numpy as np
 
 from dcc_jax import physics
 from dcc_jax.character import CONTROL_DT, FEET, GRAVITY, add_contact, sole_names
-from dcc_jax.env.task import Forces, Task, place_character, resultant
+from dcc_jax.env.task import Event, Forces, Task, place_character, resultant
 from dcc_jax.motion.reference import RefState
 
 Array = jax.Array
@@ -50,6 +50,7 @@ class Trampoline(Task):
     name: ClassVar[str] = "trampoline"
     clips: ClassVar[tuple[str, ...]] = ("stand", "balance", "jump", "jump_series")
     state_size: ClassVar[int] = 8
+    event: ClassVar[Event | None] = Event("bounce", "next_bounce")
     clock: ClassVar[str | None] = "since_bounce"
     pd_yields: ClassVar[bool] = False
     config_overrides: ClassVar[Mapping[str, Any]] = {

@@ -180,13 +180,13 @@ class Panel:
                 button = self._gui.add_button(name)
                 button.on_click(self._asks(lambda s, name=name: s.act(name)))
                 self._own.append(button)
-        if actions.has_events(simulation.task):
+        if simulation.task.event is not None:
             box = self._gui.add_checkbox("also by itself", simulation.events_on)
             box.on_update(self._asks(lambda s: _set(s, events_on=box.value)))
             self._own.append(box)
 
     def _add_parameters(self, program: Program) -> None:
-        for name, (low, high) in actions.parameters(program.task).items():
+        for name, (low, high) in program.task.adjustable.items():
             slider = self._gui.add_slider(
                 f"{name}, m", low, high, 0.05, float(getattr(program.task, name))
             )
