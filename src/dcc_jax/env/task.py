@@ -78,8 +78,7 @@ class Task:
     reference that goes on in time; not where a planner makes it."""
     pd_yields: ClassVar[bool] = True
     """Whether PD gives way to the task's `forces` from where the clips have the pose.
-    Not to forces that the clips show already, such as those that a landing makes, nor
-    to fictional ones."""
+    Not to forces that the clips show already, such as those that a landing makes."""
     start_radius: ClassVar[float] = 0.0
     """m in x and y, how far beside such a clip an episode may begin."""
     extra_actions: ClassVar[int] = 0

@@ -3,7 +3,10 @@
 A pole pivots on the crown and carries a ball at its tip; now and then the ball is
 pushed. Six more actions are fictional forces at the head and at the root. They do not
 act in the simulation: they are passed to the compliance controller alone, so that the
-policy can deform the body, and move it, without leaving its reference.
+policy can deform the body, and move it, without leaving its reference. The reward
+takes off all that such forces would have the body yield by, also what PD would give
+way by, which does not act: with u alone taken off, the ball is harder to learn
+(docs/skills/ball.md).
 
 Departure: a stand is followed in time (Appendix) where the paper has a discriminator.
 Episodes that begin in the middle of a recovery step lose the ball before anything can
@@ -55,7 +58,6 @@ class Ball(Task):
     clips: ClassVar[tuple[str, ...]] = ("stand",)
     has_reward: ClassVar[bool] = True
     follows_reference: ClassVar[bool] = True
-    pd_yields: ClassVar[bool] = False
     extra_actions: ClassVar[int] = 6
     state_size: ClassVar[int] = 12
     event: ClassVar[Event | None] = Event("nudge the ball", "next_push")
