@@ -5,8 +5,8 @@ pushed. Six more actions are fictional forces at the head and at the root. They 
 act in the simulation: they are passed to the compliance controller alone, so that the
 policy can deform the body, and move it, without leaving its reference. The reward
 takes off all that such forces would have the body yield by, also what PD would give
-way by, which does not act: with u alone taken off, the ball is harder to learn
-(docs/skills/ball.md).
+way by, which does not act: the one training with u alone taken off was by far the
+worst (docs/skills/ball.md).
 
 Departure: a stand is followed in time (Appendix) where the paper has a discriminator.
 Episodes that begin in the middle of a recovery step lose the ball before anything can
