@@ -20,18 +20,18 @@ from typing import Any
 import dcc_jax
 from dcc_jax.training import logs
 
-NARROW = {"ppo.sigma_degrees": 3.0}
 OPEN = {"disc.gradient_penalty": 10.0, "disc.instance_noise": 0.0}
 LEVERS: dict[str, dict[str, Any]] = {
     "default": {},
-    "paper": {**OPEN, "disc.feature_floor": 0.01},
+    "paper": {**OPEN, "disc.feature_floor": 0.01, "ppo.sigma_degrees": 6.0},
     "penalty 10": {"disc.gradient_penalty": 10.0},
     "penalty 200": {"disc.gradient_penalty": 200.0},
     "no instance noise": {"disc.instance_noise": 0.0},
     "instance noise 0.6": {"disc.instance_noise": 0.6},
     "floor 0.01": {"disc.feature_floor": 0.01},
-    "exploration 3 degrees": NARROW,
-    "exploration 3 degrees, penalty 10, no noise": {**NARROW, **OPEN},
+    "penalty 10, no instance noise": OPEN,
+    "exploration 6 degrees": {"ppo.sigma_degrees": 6.0},
+    "KL divergence 0.01": {"ppo.target_kl": 0.01},
     "pairs 3 steps apart": {"disc.span": 3},
     "pairs 10 steps apart": {"disc.span": 10},
     "velocities count three times": {"env.velocity_time": 0.1},

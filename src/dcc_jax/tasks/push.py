@@ -9,8 +9,9 @@ the character's, and three of them instead of six make those matrices smaller.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import flax.struct
 import jax
@@ -49,6 +50,7 @@ class Push(Task):
         *(f"recover_{angle:03d}" for angle in range(0, 360, 45)),
     )
     state_size: ClassVar[int] = 6
+    config_overrides: ClassVar[Mapping[str, Any]] = {"ppo.sigma_degrees": 3.0}
     event: ClassVar[Event | None] = Event("throw a ball", "next_throw")
     clock: ClassVar[str | None] = "since_throw"
 
