@@ -46,7 +46,7 @@ def test_settings_of_a_task_count_with_cpu_and_gpu_alone():
         p: config.make_config("ball", p).ppo.sigma_degrees for p in config.PRESETS
     }
     assert sigmas == {"smoke": 6.0, "cpu": 3.0, "gpu": 3.0, "paper": 6.0}
-    assert config.make_config("push").ppo.sigma_degrees == 6.0
+    assert config.make_config("door").ppo.sigma_degrees == 6.0
 
 
 @pytest.mark.parametrize("preset", config.PRESETS)

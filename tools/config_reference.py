@@ -19,7 +19,7 @@ from dcc_jax.config import PRESETS, make_config
 from dcc_jax.env.task import Task
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "configuration.md"
-TYPICAL = "push"  # a task that changes no preset
+TYPICAL = "door"  # a task that changes no preset
 
 _OPENING = """# Configuration
 
