@@ -185,6 +185,26 @@ def test_a_reference_outside_its_ranges_is_not_drawn_in():
     np.testing.assert_allclose(ranges.clip(COORDS, room, beyond), REST.u, atol=1e-6)
 
 
+@pytest.mark.parametrize("size", [0.0, 0.01, 0.1])
+def test_displacement_of_a_tangent_is_its_exponential_to_second_order(size):
+    q_m = load_clip(asset_path("motions/walk_cycle.npz")).qpos.astype(np.float32)
+    w = np.random.default_rng(0).normal(size=(len(q_m), MODEL.nv))
+    w = size * jnp.asarray(w / np.abs(w).max(), jnp.float32)
+
+    @jax.vmap
+    def both(q_m, w):
+        room, exact = CONTROLLER.room(q_m), quat.exp_map(COORDS, w)
+        clear = room.used(room.turned(COORDS.split_q(exact)[1][1:]) - room.r) < 0.99
+        return ranges.displaced(COORDS, room, w), exact, clear
+
+    u, exact, clear = both(q_m, w)
+    off = np.abs(quat.log_map(COORDS, u) - w)[:, 6:].reshape(*clear.shape, 3)
+    off, clear = np.asarray(off).max(-1), np.asarray(clear)
+    assert clear.mean() > 0.5
+    assert off[clear].max() <= size**2
+    np.testing.assert_allclose(u[:, :7], exact[:, :7], atol=1e-7)
+
+
 def test_who_is_turned_beyond_half_a_turn_comes_back_to_the_side_where_he_left():
     hinge = 6 + 3 * CHARACTER.joint_names.index("left_elbow") + 2
     upper = CHARACTER.upper[CHARACTER.joint_names.index("left_elbow"), 2]

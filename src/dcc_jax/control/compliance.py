@@ -174,9 +174,10 @@ def admittance(
     _, share = _softening(controller, alpha, J.dtype)
     yd = _sprung(controller, displacement.y - rest, displacement.yd)
     y = displacement.y + dt * yd
-    u = quat.exp_map(coords, share * y)
-    if room is not None:
-        u = ranges.clip(coords, room, u)
+    if room is None:
+        u = quat.exp_map(coords, share * y)
+    else:
+        u = ranges.displaced(coords, room, share * y)
     return Displacement(u=u, ud=share * yd, y=y, yd=yd)
 
 

@@ -107,6 +107,27 @@ def used(coords: quat.Coordinates, room: Room, tangent: Array) -> Array:
     return jnp.maximum(room.used(times(room.turning, joints)), half_turns)
 
 
+def displaced(coords: quat.Coordinates, room: Room, tangent: Array) -> Array:
+    """A displacement u [nq] with q_m (+) u in its ranges, of a tangent [nv].
+
+    A joint's rotation vector goes from r to r + Jr^-1(r) w, and no farther than to the
+    sides of its box. To first order that is q_m exp(w), and no logarithm is needed to
+    know where it ends. u is exactly the identity where w is zero.
+
+    Args:
+        coords: of the character.
+        room: of its q_m.
+        tangent: the root's part in m, rad elsewhere.
+    """
+    scalars, tangents = coords.split_v(tangent)
+    turns, joints = tangents[: -len(room.r)], tangents[-len(room.r) :]
+    ends = jnp.clip(room.r + times(room.turning, joints), room.lower, room.upper)
+    moved = quat.mul(quat.inv(room.pose), quat.exp(ends))
+    still = jnp.all(joints == 0.0, axis=-1, keepdims=True)
+    moved = jnp.where(still, jnp.eye(4, dtype=moved.dtype)[0], moved)
+    return coords.join_q(scalars, jnp.concatenate([quat.exp(turns), moved]))
+
+
 def clip(coords: quat.Coordinates, room: Room, u: Array) -> Array:
     """The displacement [nq] with q_m (+) u in its ranges; unchanged where it is."""
     scalars, quats = coords.split_q(u)
