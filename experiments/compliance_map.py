@@ -75,7 +75,9 @@ def pushed(scene: physics.Scene, config: ComplianceConfig):
         f = force * (time < PUSH_SECONDS)
         given = controller, displacement, J[None], f[None], alpha, room
         if config.law == "admittance":
-            displacement = compliance.admittance(*given)
+            displacement = compliance.admittance(
+                controller, displacement, f @ J, alpha, room
+            )
         elif config.law == "measured":
             displacement = compliance.measured(*given, jnp.matmul(J, state.qvel)[None])
         else:

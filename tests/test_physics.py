@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -111,6 +112,33 @@ def test_point_jacobians_and_positions_equal_c_mujoco(scene, landing):
             theirs = np.zeros((3, scene.model.nv))
             mujoco.mj_jacBody(scene.model, data, theirs, None, scene.body(name))
             np.testing.assert_allclose(ours, theirs, atol=2e-6)
+
+
+def test_generalized_force_of_two_forces_equals_c_mujoco(scene, landing):
+    c, _, _ = landing
+    rng = np.random.default_rng(4)
+    bodies = np.array([scene.body("left_hand"), scene.body("head")])
+    force_w = 50.0 * rng.normal(size=(BATCH, 2, 3))
+    point_w = np.stack([data.xpos[bodies] for data in c])
+    point_w += 0.1 * rng.normal(size=point_w.shape)
+
+    @jax.jit
+    @jax.vmap
+    def ours(qpos, qvel, point_w, force_w):
+        state = physics.State(qpos, qvel, jnp.zeros_like(qvel))
+        kin = physics.kinematics(scene, state)
+        where = point_w, jnp.asarray(bodies)
+        return physics.generalized_force(scene, kin, *where, force_w)
+
+    states = (np.stack([getattr(d, name) for d in c]) for name in ("qpos", "qvel"))
+    given = (jnp.asarray(x, jnp.float32) for x in (*states, point_w, force_w))
+    for i, found in enumerate(np.asarray(ours(*given))):
+        theirs = np.zeros(scene.model.nv)
+        for body, point, force in zip(bodies, point_w[i], force_w[i], strict=True):
+            mujoco.mj_applyFT(
+                scene.model, c[i], force, np.zeros(3), point, body, theirs
+            )
+        np.testing.assert_allclose(found, theirs, atol=1e-5 * np.abs(theirs).max())
 
 
 def test_stable_pd_is_the_explicit_equation(character: Character):

@@ -38,7 +38,7 @@ def course(q_m, J, force, alpha, seconds):
     def step(displacement, index):
         f = force * (index * DT < seconds)
         displacement = compliance.admittance(
-            CONTROLLER, displacement, J[None], f[None], alpha, room
+            CONTROLLER, displacement, f @ J, alpha, room
         )
         return displacement, quat.log_map(COORDS, displacement.u)
 

@@ -448,11 +448,12 @@ def controllers(arm: Arm, law: str):
     q_m = jnp.asarray(arm.q_m, jnp.float32)
 
     def step(displacement, J, qvel, force, alpha):
-        given = of_arm, displacement, J[None], force[None], alpha, None
         if law == "measured":
-            displacement = compliance.measured(*given, (J @ qvel)[None])
+            given = J[None], force[None], alpha, None, (J @ qvel)[None]
+            displacement = compliance.measured(of_arm, displacement, *given)
         else:
-            displacement = compliance.admittance(*given)
+            given = force @ J, alpha, None
+            displacement = compliance.admittance(of_arm, displacement, *given)
         return displacement, quat.oplus(coords, q_m, displacement.u)
 
     return compliance.at_rest(coords), jax.jit(jax.vmap(step))

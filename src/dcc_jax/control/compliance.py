@@ -143,8 +143,7 @@ def measured(
 def admittance(
     controller: Controller,
     displacement: Displacement,
-    J: Array,
-    forces: Array,
+    torque: Array,
     alpha: Array,
     room: Room | None,
 ) -> Displacement:
@@ -162,16 +161,14 @@ def admittance(
     Args:
         controller: of the character.
         displacement: before the step.
-        J: Jacobians of the points where the forces act [F, 3, nv], world frame.
-        forces: N, world frame [F, 3]; exactly zero where none acts.
+        torque: J^T f, summed over the forces [nv]; exactly zero where none acts.
         alpha: level of compliance, in [0, 1) (unchecked: it is traced).
         room: of the reference, that its yield stays in; see `Controller.room`.
     """
-    chex.assert_shape(J, (None, 3, controller.coords.nv))
     coords, dt = controller.coords, controller.dt
-    torque = jnp.sum(transpose_times(J, forces), axis=0)
+    chex.assert_shape(torque, (coords.nv,))
     rest = yield_at_rest(controller, torque, alpha, room)
-    _, share = _softening(controller, alpha, J.dtype)
+    _, share = _softening(controller, alpha, torque.dtype)
     yd = _sprung(controller, displacement.y - rest, displacement.yd)
     y = displacement.y + dt * yd
     if room is None:

@@ -56,13 +56,17 @@ class Side:
     ) -> Displacement:
         """u and its velocity a physics step later."""
         scene = self.scene
-        jacobian = jax.vmap(lambda p, b: physics.point_jacobian(scene, kin, p, b))
-        J = scene.character_qvel(jacobian(forces.point_w, forces.body))
         force = jnp.where(forces.gate, forces.force_w, 0.0)
-        controller, law = self.controller, self.controller.config.law
-        given = controller, carry.displacement, J, force, inputs.alpha, inputs.room
+        where = forces.point_w, forces.body
+        before, law = (self.controller, carry.displacement), self.controller.config.law
+        level = inputs.alpha, inputs.room
         if law == "admittance":
-            return compliance.admittance(*given)
+            torque = physics.generalized_force(scene, kin, *where, force)
+            torque = scene.character_qvel(torque)
+            return compliance.admittance(*before, torque, *level)
+        jacobian = jax.vmap(lambda p, b: physics.point_jacobian(scene, kin, p, b))
+        J = scene.character_qvel(jacobian(*where))
+        given = *before, J, force, *level
         if law == "measured":
             xd = relative.velocity(scene, self.kinematics, carry, inputs, J, forces)
             return compliance.measured(*given, xd)

@@ -194,6 +194,28 @@ def point_jacobian(scene: Scene, kin: Kinematics, point_w: Array, body: Array) -
     return (speed * jnp.asarray(scene.moves)[body][:, None]).T
 
 
+def generalized_force(
+    scene: Scene, kin: Kinematics, point_w: Array, body: Array, force_w: Array
+) -> Array:
+    """J^T f [nv], N and N m, of forces at points that are fixed to bodies, summed.
+
+    What `point_jacobian` says, without J: a force and its moment about the centre of
+    mass of the kinematic tree do work along each motion `cdof` of the bodies it moves.
+
+    Args:
+        scene: static.
+        kin: of the state.
+        point_w: m, world [F, 3].
+        body: ids [F].
+        force_w: N, world [F, 3].
+    """
+    data = kin.data
+    center_w = data.subtree_com[jnp.asarray(scene.mjx_model.body_rootid)[body]]
+    wrench = jnp.concatenate([jnp.cross(point_w - center_w, force_w), force_w], axis=-1)
+    power = jnp.sum(wrench[:, None] * data.cdof, axis=-1)
+    return jnp.sum(jnp.asarray(scene.moves)[body] * power, axis=0)
+
+
 def mass_matrix(scene: Scene, kin: Kinematics) -> Array:
     """M [nv, nv], kg, kg m and kg m^2, with h*kv and armature on its diagonal.
 

@@ -168,7 +168,9 @@ class SustainedPush(Task):
     ) -> Array:
         """J^T f at the body's centre of mass."""
         body, point = self._place(scene, state, kin)
-        return state.force_w @ physics.point_jacobian(scene, kin, point, body)
+        return physics.generalized_force(
+            scene, kin, point[None], body[None], state.force_w[None]
+        )
 
     def forces(
         self,
