@@ -212,8 +212,8 @@ def generalized_force(
     data = kin.data
     center_w = data.subtree_com[jnp.asarray(scene.mjx_model.body_rootid)[body]]
     wrench = jnp.concatenate([jnp.cross(point_w - center_w, force_w), force_w], axis=-1)
-    power = jnp.sum(wrench[:, None] * data.cdof, axis=-1)
-    return jnp.sum(jnp.asarray(scene.moves)[body] * power, axis=0)
+    moved = jnp.asarray(scene.moves)[body].astype(wrench.dtype)
+    return jnp.sum((moved.T @ wrench) * data.cdof, axis=-1)
 
 
 def mass_matrix(scene: Scene, kin: Kinematics) -> Array:
