@@ -102,7 +102,7 @@ def test_checkpoint_of_an_older_version_is_refused_in_one_line(run_dir):
 
 def test_policy_of_another_meaning_is_refused(tmp_path, monkeypatch):
     with monkeypatch.context() as earlier:
-        earlier.setattr(checkpoint, "_FORMAT", checkpoint._FORMAT - 1)
+        earlier.setattr(checkpoint, "_POLICY_FORMAT", checkpoint._POLICY_FORMAT - 1)
         checkpoint.save_policy(tmp_path, _policy())
         checkpoint.load_policy(tmp_path)
     with pytest.raises(
@@ -113,7 +113,7 @@ def test_policy_of_another_meaning_is_refused(tmp_path, monkeypatch):
 
 def test_state_of_another_meaning_is_refused(run_dir, monkeypatch):
     with monkeypatch.context() as earlier:
-        earlier.setattr(checkpoint, "_FORMAT", checkpoint._FORMAT - 1)
+        earlier.setattr(checkpoint, "_STATE_FORMAT", checkpoint._STATE_FORMAT - 1)
         checkpoint.save(run_dir, 6, _state(6), keep=3)
         assert checkpoint.restore_latest(run_dir, _state(0), _silent) is not None
     with pytest.raises(ValueError, match=r"000000006 was written by an older version"):

@@ -136,6 +136,6 @@ class ToyConfig:
     )
     train: TrainConfig = field(
         default_factory=lambda: TrainConfig(
-            num_envs=32, unroll_length=16, warm_start_steps=0
+            num_envs=32, unroll_length=16, warm_start_steps=0, averaged_updates=3
         )
     )

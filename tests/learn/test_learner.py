@@ -50,9 +50,25 @@ def test_donated_state_is_gone(compiled, first_state):
     assert first_state.agent.policy.params.layers[0].kernel.is_deleted()
 
 
+def test_averaged_policy_is_the_mean_of_the_last_updates(compiled, first_state):
+    count = compiled.config.train.averaged_updates
+    assert count == 3
+    state, kernel, expected = first_state, np.zeros(()), np.zeros(())
+    for update in range(1, 6):
+        state, _ = compiled.update(state)
+        kernel = np.asarray(state.agent.policy.params.layers[0].kernel)
+        share = 1.0 / min(update, count)
+        expected = (1.0 - share) * expected + share * kernel
+        found = state.averaged.layers[0].kernel
+        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-7)
+    assert np.abs(kernel - expected).max() > 1e-4
+
+
 def test_parameters_are_the_same_on_every_device(compiled, first_state):
     state, _ = compiled.update(first_state)
-    for leaf in jax.tree.leaves((state.agent, state.disc, state.obs_normalizer)):
+    for leaf in jax.tree.leaves(
+        (state.agent, state.averaged, state.disc, state.obs_normalizer)
+    ):
         shards = [np.asarray(shard.data) for shard in leaf.addressable_shards]
         for shard in shards[1:]:
             np.testing.assert_array_equal(shard, shards[0])

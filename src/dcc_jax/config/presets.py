@@ -60,6 +60,7 @@ _PAPER = {
     "disc.minibatches": 128,
     "train.num_envs": 16,
     "train.unroll_length": 128,
+    "train.averaged_updates": 1,
     "train.warm_start_steps": 0,
     "train.total_tuples": 80_000_000,
     "train.checkpoint_interval": 200,

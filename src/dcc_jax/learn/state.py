@@ -55,6 +55,11 @@ class TrainConfig:
     checkpoint_interval: int = 50
     """Updates between checkpoints; one is also written at the end and on a signal."""
 
+    averaged_updates: int = 100
+    """The policy that a run gives is the mean of its parameters over about so many
+    updates, which is nearer to the clips than what any one update leaves (Polyak 1992;
+    not the paper's). 1: the last one."""
+
     keep_checkpoints: int = 3
     """The last few that stay on disk."""
 
@@ -65,6 +70,7 @@ class TrainConfig:
             "total_tuples",
             "checkpoint_interval",
             "keep_checkpoints",
+            "averaged_updates",
         ):
             value = getattr(self, name)
             if value < 1:
@@ -109,6 +115,7 @@ class TrainState:
     """Everything a run is: resuming from it continues bit for bit."""
 
     agent: ppo.Agent
+    averaged: networks.Mlp  # the policy's parameters, mean over the last updates
     disc: networks.Network
     obs_normalizer: normalizer.Normalizer  # of the policy's observation
     feature_normalizer: normalizer.Normalizer  # of the discriminator's features
@@ -177,6 +184,7 @@ def init_state(
     disc = networks.init_mlp(disc_key, (width, *config.disc.hidden, 1))
     return TrainState(
         agent=agent,
+        averaged=agent.policy.params,
         disc=networks.init_network(disc, discriminator.make_optimizer(config.disc)),
         obs_normalizer=obs_normalizer,
         feature_normalizer=normalizer.moments(s),

@@ -85,13 +85,19 @@ def update_state(
     agent, of_ppo = ppo.update(ppo_key, state.agent, batch, config.ppo, AXIS)
     if config.train.start_from is not None:
         agent = _policy_waiting(state, agent)
+    count = jnp.minimum(state.update + 1, config.train.averaged_updates)
+    averaged = networks.averaged(state.averaged, agent.policy.params, 1.0 / count)
     metrics |= of_reward | of_ppo
     episodes = _episodes(taken.transitions)
     metrics, seen, episodes = all_gather_tree((metrics, seen, episodes), AXIS)
     metrics = jax.tree.map(lambda x: jnp.mean(x, axis=0), metrics)
     state, of_episodes = _counted(state, episodes)
     state = dataclasses.replace(
-        _seen(state, seen), agent=agent, running=taken.running, key=key
+        _seen(state, seen),
+        agent=agent,
+        averaged=averaged,
+        running=taken.running,
+        key=key,
     )
     incident = jax.tree.map(lambda x: x[None], taken.incident)
     return state, UpdateReport(metrics=metrics | of_episodes, incident=incident)

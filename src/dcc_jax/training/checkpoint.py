@@ -27,9 +27,10 @@ from dcc_jax.learn.rollout import Policy
 
 _FOLDER = "checkpoints"
 _DIGITS = 9  # of an update in the name of its checkpoint
-_FORMAT = 3
-"""Of states and policies: raised when their arrays come to mean something else. 3:
-discriminator and policy see velocities."""
+_STATE_FORMAT = 4
+_POLICY_FORMAT = 3
+"""Raised when their arrays come to mean something else. 3: discriminator and policy see
+velocities. 4: a state holds the averaged policy."""
 
 
 class CheckpointError(RuntimeError):
@@ -49,7 +50,7 @@ def save(run_dir: Path, update: int, state: Any, keep: int) -> Path:
         CheckpointError: it could not be written; the earlier ones are as they were.
     """
     path = _path(run_dir, update)
-    arrays = to_arrays(state) | {"format": np.array(_FORMAT)}
+    arrays = to_arrays(state) | {"format": np.array(_STATE_FORMAT)}
     items = ocp.args.Composite(
         state=ocp.args.StandardSave(arrays),
         digests=ocp.args.JsonSave(_digests(arrays)),
@@ -101,7 +102,7 @@ def restore_latest(
         except CheckpointError as error:
             say(f"skipping damaged checkpoint {path}: {error}")
             continue
-        if arrays.pop("format", None) != _FORMAT:
+        if arrays.pop("format", None) != _STATE_FORMAT:
             _refuse(path)
         return update, from_arrays(arrays, template)
     if updates:
@@ -144,7 +145,7 @@ def save_policy(directory: Path, policy: Policy) -> Path:
     partial = directory / "policy.partial.npz"
     arrays = to_arrays(policy) | {
         "activation": np.array(policy.params.activation),
-        "format": np.array(_FORMAT),
+        "format": np.array(_POLICY_FORMAT),
     }
     np.savez(partial, **arrays)  # pyright: ignore[reportArgumentType]
     os.replace(partial, path)
@@ -182,7 +183,7 @@ def load_policy(directory: Path) -> Policy:
         raise ValueError(f"{directory} holds no policy.npz") from None
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path} is damaged: {error}") from None
-    if arrays.get("format") != _FORMAT:
+    if arrays.get("format") != _POLICY_FORMAT:
         _refuse(path)
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(policy)):
         raise ValueError(f"{path} is damaged: some of its numbers are not finite")
@@ -261,8 +262,8 @@ def _digests(arrays: dict[str, np.ndarray]) -> dict[str, str]:
 
 def _refuse(path: Path) -> NoReturn:
     raise ValueError(
-        f"{path} was written by an older version of dcc_jax, which observed something "
-        "else; train it again"
+        f"{path} was written by an older version of dcc_jax, whose runs hold other "
+        "numbers; train it again"
     )
 
 

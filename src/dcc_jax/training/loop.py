@@ -235,7 +235,7 @@ def _floats(metrics: dict[str, jax.Array]) -> dict[str, float]:
 
 
 def _policy(state: TrainState) -> Policy:
-    return Policy(params=state.agent.policy.params, normalizer=state.obs_normalizer)
+    return Policy(params=state.averaged, normalizer=state.obs_normalizer)
 
 
 def _finish(

@@ -230,7 +230,7 @@ def _save(sweep: _Sweep, done: int, state: TrainState) -> None:
 
 
 def _policies(sweep: _Sweep, host: TrainState) -> dict[plan.Setting, Policy]:
-    of_all = Policy(params=host.agent.policy.params, normalizer=host.obs_normalizer)
+    of_all = Policy(params=host.averaged, normalizer=host.obs_normalizer)
     return {
         setting: jax.tree.map(lambda x, i=i: x[i], of_all)
         for i, setting in enumerate(sweep.settings)
