@@ -13,11 +13,13 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
 import dcc_jax
+from dcc_jax.config import load
 from dcc_jax.training import logs
 
 OPEN = {"disc.gradient_penalty": 10.0, "disc.instance_noise": 0.0}
@@ -32,6 +34,7 @@ LEVERS: dict[str, dict[str, Any]] = {
     "penalty 10, no instance noise": OPEN,
     "exploration 6 degrees": {"ppo.sigma_degrees": 6.0},
     "KL divergence 0.01": {"ppo.target_kl": 0.01},
+    "the last update's policy": {"train.averaged_updates": 1},
     "pairs 3 steps apart": {"disc.span": 3},
     "pairs 10 steps apart": {"disc.span": 10},
     "velocities count three times": {"env.velocity_time": 0.1},
@@ -55,10 +58,8 @@ LAST = 20  # updates, of whose metrics the mean is taken
 
 def trained(task: str, lever: str, seed: int, tuples: int, out: Path) -> dict[str, Any]:
     """What a training came to; read where it is there already."""
-    folder = out / f"{task}-{lever.replace(' ', '-').replace(',', '')}-{tuples}-{seed}"
+    folder = out / f"{task}-{re.sub("[ ,']+", '-', lever)}-{tuples}-{seed}"
     table = folder / "bench.json"
-    if table.exists():
-        return json.loads(table.read_text())
     config = dcc_jax.make_config(task, preset="cpu").with_(
         {
             "seed": seed,
@@ -67,6 +68,10 @@ def trained(task: str, lever: str, seed: int, tuples: int, out: Path) -> dict[st
             **LEVERS[lever],
         }
     )
+    if table.exists():
+        if load(folder) != config:
+            raise SystemExit(f"{folder} was trained otherwise; --out names another")
+        return json.loads(table.read_text())
     resume = folder.exists()
     if not dcc_jax.train(config, run_dir=folder, resume=resume, quiet=True).finished:
         raise SystemExit(f"stopped in {folder}; the same command goes on")

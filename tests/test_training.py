@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import random
 import signal
@@ -10,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -92,6 +94,22 @@ def test_run_killed_at_random_and_resumed_is_the_same_run(uninterrupted, tmp_pat
     output, _ = process.communicate(timeout=600)
     assert process.returncode == 0, output
     assert _comparable(run_dir) == _comparable(uninterrupted)
+    ours, theirs = (checkpoint.load_policy(d) for d in (run_dir, uninterrupted))
+    jax.tree.map(np.testing.assert_array_equal, ours, theirs)
+
+
+def test_policy_of_a_run_is_the_mean_of_those_of_its_updates(tmp_path):
+    def kernel(updates: int, averaged: int) -> np.ndarray:
+        config = toy_config(updates)
+        train = dataclasses.replace(config.train, averaged_updates=averaged)
+        config = dataclasses.replace(config, train=train)
+        run_dir = tmp_path / f"{updates}-{averaged}"
+        loop.train(config, run_dir=run_dir, environment=Toy(), quiet=True)
+        return np.asarray(checkpoint.load_policy(run_dir).params.layers[0].kernel)
+
+    one, two = kernel(1, 1), kernel(2, 1)
+    assert np.abs(two - one).max() > 1e-5
+    np.testing.assert_allclose(kernel(2, 5), 0.5 * (one + two), rtol=1e-5, atol=1e-8)
 
 
 def test_sigterm_saves_says_so_and_leaves_with_zero(uninterrupted, tmp_path):

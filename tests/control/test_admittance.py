@@ -185,6 +185,26 @@ def test_a_reference_outside_its_ranges_is_not_drawn_in():
     np.testing.assert_allclose(ranges.clip(COORDS, room, beyond), REST.u, atol=1e-6)
 
 
+def test_no_tangent_takes_a_joint_out_of_its_ranges():
+    q_m, *_ = pushed(0.0, 0.5)
+    q_m = np.array(q_m, np.float32)
+    q_m[0, 7:11] = np.cos(0.8), 0.0, np.sin(0.8), 0.0  # outside, and may come back
+    w = 2.0 * np.random.default_rng(0).normal(size=(len(q_m), MODEL.nv))
+
+    @jax.vmap
+    def ends(q_m, w):
+        room = CONTROLLER.room(q_m)
+        u = ranges.displaced(COORDS, room, w)
+        return room.turned(COORDS.split_q(u)[1][1:]), room.lower, room.upper
+
+    r, lower, upper = (np.asarray(x) for x in ends(q_m, w.astype(np.float32)))
+    short = np.linalg.norm(np.clip(r, lower, upper), axis=-1) < np.pi
+    assert short.mean() > 0.9
+    assert np.all((r > lower - 1e-5) & (r < upper + 1e-5), where=short[..., None])
+    at_a_side = np.isclose(r, lower, atol=1e-5) | np.isclose(r, upper, atol=1e-5)
+    assert at_a_side.any(axis=-1).mean() > 0.5
+
+
 @pytest.mark.parametrize("size", [0.0, 0.01, 0.1])
 def test_displacement_of_a_tangent_is_its_exponential_to_second_order(size):
     q_m = load_clip(asset_path("motions/walk_cycle.npz")).qpos.astype(np.float32)

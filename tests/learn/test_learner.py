@@ -50,7 +50,7 @@ def test_donated_state_is_gone(compiled, first_state):
     assert first_state.agent.policy.params.layers[0].kernel.is_deleted()
 
 
-def test_averaged_policy_is_the_mean_of_the_last_updates(compiled, first_state):
+def test_policy_that_a_run_gives_is_a_mean_over_updates(compiled, first_state):
     count = compiled.config.train.averaged_updates
     assert count == 3
     state, kernel, expected = first_state, np.zeros(()), np.zeros(())

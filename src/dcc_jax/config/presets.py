@@ -40,6 +40,7 @@ _GPU = {
     "ppo.minibatch_size": 16384,
     "disc.minibatch_size": 2048,
     "train.num_envs": 4096,
+    "train.averaged_updates": 10,
     "train.total_tuples": 80_000_000,
 }
 

@@ -239,7 +239,8 @@ def whole_yield(controller: Controller, displacement: Displacement) -> Array:
     """Where forces have the pose, relative to the reference: q_m (+) this, [nq].
 
     With `admittance` the yield of Eq. (7), of which u is a part and PD gives way by the
-    rest. The other laws do not know what PD does, and it is u.
+    rest; to first order, since no joint range bounds what PD gives way by. The other
+    laws do not know what PD does, and it is u.
     """
     if controller.config.law == "admittance":
         return quat.exp_map(controller.coords, displacement.y)

@@ -112,7 +112,8 @@ def displaced(coords: quat.Coordinates, room: Room, tangent: Array) -> Array:
 
     A joint's rotation vector goes from r to r + Jr^-1(r) w, and no farther than to the
     sides of its box. To first order that is q_m exp(w), and no logarithm is needed to
-    know where it ends. u is exactly the identity where w is zero.
+    know where it ends. In a corner it may be longer than half a turn, as of
+    `Room.turned`. u is exactly the identity where w is zero.
 
     Args:
         coords: of the character.

@@ -138,11 +138,6 @@ def with_learning_rate(network: Network, learning_rate: Array) -> Network:
     return dataclasses.replace(network, opt_state=changed)
 
 
-def averaged(before: Mlp, now: Mlp, share: Array) -> Mlp:
-    """Parameters on the way from `before` to `now`, by a share [] in [0, 1] of it."""
-    return jax.tree.map(lambda a, b: a + share * (b - a), before, now)
-
-
 def apply_gradients(
     network: Network, gradient: Mlp, optimizer: Optimizer
 ) -> tuple[Network, Array]:

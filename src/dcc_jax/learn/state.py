@@ -56,9 +56,9 @@ class TrainConfig:
     """Updates between checkpoints; one is also written at the end and on a signal."""
 
     averaged_updates: int = 100
-    """The policy that a run gives is the mean of its parameters over about so many
-    updates, which is nearer to the clips than what any one update leaves (Polyak 1992;
-    not the paper's). 1: the last one."""
+    """The policy that a run gives has the mean of its parameters over all updates, and
+    after so many an exponential one of that length (not the paper's). 1: the last
+    ones."""
 
     keep_checkpoints: int = 3
     """The last few that stay on disk."""
@@ -115,7 +115,7 @@ class TrainState:
     """Everything a run is: resuming from it continues bit for bit."""
 
     agent: ppo.Agent
-    averaged: networks.Mlp  # the policy's parameters, mean over the last updates
+    averaged: networks.Mlp  # the policy's parameters, their mean over updates
     disc: networks.Network
     obs_normalizer: normalizer.Normalizer  # of the policy's observation
     feature_normalizer: normalizer.Normalizer  # of the discriminator's features

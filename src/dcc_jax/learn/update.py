@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import optax
 
 from dcc_jax.env import rewards
 from dcc_jax.learn import discriminator, networks, normalizer, ppo
@@ -85,8 +86,7 @@ def update_state(
     agent, of_ppo = ppo.update(ppo_key, state.agent, batch, config.ppo, AXIS)
     if config.train.start_from is not None:
         agent = _policy_waiting(state, agent)
-    count = jnp.minimum(state.update + 1, config.train.averaged_updates)
-    averaged = networks.averaged(state.averaged, agent.policy.params, 1.0 / count)
+    averaged = _averaged(state, agent, config.train)
     metrics |= of_reward | of_ppo
     episodes = _episodes(taken.transitions)
     metrics, seen, episodes = all_gather_tree((metrics, seen, episodes), AXIS)
@@ -101,6 +101,19 @@ def update_state(
     )
     incident = jax.tree.map(lambda x: x[None], taken.incident)
     return state, UpdateReport(metrics=metrics | of_episodes, incident=incident)
+
+
+def _averaged(state: TrainState, agent: ppo.Agent, config: TrainConfig) -> networks.Mlp:
+    """The mean of the policies of all updates, later one that forgets the older ones.
+
+    Departure: the paper takes the last policy, as `train.averaged_updates = 1` does.
+    """
+    waited = 0 if config.start_from is None else VALUE_FIRST
+    count = jnp.clip(state.update + 1 - waited, 1, config.averaged_updates)
+    now: Any = agent.policy.params  # Any: optax's types know no dataclass
+    before: Any = state.averaged
+    mean: Any = optax.incremental_update(now, before, 1.0 / count)
+    return mean
 
 
 def _policy_waiting(state: TrainState, agent: ppo.Agent) -> ppo.Agent:
