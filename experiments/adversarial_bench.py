@@ -58,7 +58,8 @@ LAST = 20  # updates, of whose metrics the mean is taken
 
 def trained(task: str, lever: str, seed: int, tuples: int, out: Path) -> dict[str, Any]:
     """What a training came to; read where it is there already."""
-    folder = out / f"{task}-{re.sub("[ ,']+", '-', lever)}-{tuples}-{seed}"
+    name = re.sub(r"\W+", "-", lever)
+    folder = out / f"{task}-{name}-{tuples}-{seed}"
     table = folder / "bench.json"
     config = dcc_jax.make_config(task, preset="cpu").with_(
         {
