@@ -19,7 +19,6 @@ from statistics import fmean
 from typing import Any
 
 import dcc_jax
-from dcc_jax.config import load
 from dcc_jax.training import logs
 
 OPEN = {"disc.gradient_penalty": 10.0, "disc.instance_noise": 0.0}
@@ -70,6 +69,9 @@ def trained(task: str, lever: str, seed: int, tuples: int, out: Path) -> dict[st
         }
     )
     if table.exists():
+        # Not sooner: jax has to find the settings that `dcc_jax.train` makes for it.
+        from dcc_jax.config import load
+
         if load(folder) != config:
             raise SystemExit(f"{folder} was trained otherwise; --out names another")
         return json.loads(table.read_text())
