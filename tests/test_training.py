@@ -112,6 +112,22 @@ def test_policy_of_a_run_is_the_mean_of_those_of_its_updates(tmp_path):
     np.testing.assert_allclose(kernel(2, 5), 0.5 * (one + two), rtol=1e-5, atol=1e-8)
 
 
+def test_run_that_cannot_go_on_stays_as_it_is(tmp_path, monkeypatch):
+    with monkeypatch.context() as earlier:
+        earlier.setattr(checkpoint, "_STATE_FORMAT", checkpoint._STATE_FORMAT - 1)
+        loop.train(toy_config(2), run_dir=tmp_path, environment=Toy(), quiet=True)
+    before = {p.name: p.read_bytes() for p in tmp_path.glob("*.*")}
+    with pytest.raises(ValueError, match="written by an older version"):
+        loop.train(
+            toy_config(4),
+            run_dir=tmp_path,
+            resume=True,
+            environment=Toy(),
+            quiet=True,
+        )
+    assert {p.name: p.read_bytes() for p in tmp_path.glob("*.*")} == before
+
+
 def test_sigterm_saves_says_so_and_leaves_with_zero(uninterrupted, tmp_path):
     run_dir = tmp_path / "stopped"
     process = _start(run_dir)

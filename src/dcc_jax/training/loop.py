@@ -98,7 +98,8 @@ def prepare(
     learner.check_sizes(wanted, mesh.size)
     first = not (resume and checkpoint.available(place))
     start = starting_policy(wanted, environment) if first else None
-    processes.by_the_first(lambda: folder.begin(place, wanted))
+    if first:
+        processes.by_the_first(lambda: folder.begin(place, wanted))
     return Run(wanted, place, environment, mesh, resume, start)
 
 
@@ -194,9 +195,10 @@ def _prepared(
 
 
 def _restored(run: Run, template: TrainState, say: Callable[[str], None]) -> TrainState:
-    """The state of the last checkpoint that can be read."""
+    """The state of the last checkpoint that can be read, in a run that goes on."""
     found = checkpoint.restore_latest(run.run_dir, template, say)
     assert found is not None
+    processes.by_the_first(lambda: folder.begin(run.run_dir, run.config))
     update, arrays = found
     say(f"resuming {run.run_dir} after update {update}")
     kept = (run.run_dir / "metrics.jsonl").exists()
