@@ -56,9 +56,9 @@ class TrainConfig:
     """Updates between checkpoints; one is also written at the end and on a signal."""
 
     averaged_updates: int = 100
-    """The policy that a run gives has the mean of its parameters over all updates, and
-    after so many an exponential one of that length (not the paper's). 1: the last
-    ones."""
+    """The policy that a run gives has the mean of the parameters after every update,
+    and beyond so many updates an exponential mean of that length (not the paper's). 1:
+    the parameters after the last update."""
 
     keep_checkpoints: int = 3
     """The last few that stay on disk."""
