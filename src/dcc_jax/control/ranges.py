@@ -77,6 +77,10 @@ class Room:
         """
         return quat.long_log(quat.mul(self.pose, u))
 
+    def turning_to(self, r: Array) -> Array:
+        """The quaternions u [J, 4] with log(q_m u) = r, r [J, 3] rad."""
+        return quat.mul(quat.inv(self.pose), quat.exp(r))
+
 
 def bounded(coords: quat.Coordinates, room: Room, rest: Array) -> Array:
     """A displacement's tangent [nv] shortened so that it stays in the room.
@@ -90,8 +94,7 @@ def bounded(coords: quat.Coordinates, room: Room, rest: Array) -> Array:
         room: of its q_m.
         rest: the root's part in m, rad elsewhere.
     """
-    scalars, tangents = coords.split_v(rest)
-    turns, joints = tangents[: -len(room.r)], tangents[-len(room.r) :]
+    scalars, turns, joints = _parts(coords, room, rest)
     joints = joints * _shortened(used(coords, room, rest))[:, None]
     away = jnp.sqrt(jnp.sum(scalars**2) + 1e-12) / ROOT_ROOM
     return coords.join_v(scalars * _shortened(away), jnp.concatenate([turns, joints]))
@@ -102,7 +105,7 @@ def used(coords: quat.Coordinates, room: Room, tangent: Array) -> Array:
 
     Nor can it use more than half a turn: PD goes to its target the short way.
     """
-    joints = coords.split_v(tangent)[1][-len(room.r) :]
+    _, _, joints = _parts(coords, room, tangent)
     half_turns = jnp.sqrt(jnp.sum(joints * joints, axis=-1)) / jnp.pi
     return jnp.maximum(room.used(times(room.turning, joints)), half_turns)
 
@@ -120,12 +123,10 @@ def displaced(coords: quat.Coordinates, room: Room, tangent: Array) -> Array:
         room: of its q_m.
         tangent: the root's part in m, rad elsewhere.
     """
-    scalars, tangents = coords.split_v(tangent)
-    turns, joints = tangents[: -len(room.r)], tangents[-len(room.r) :]
+    scalars, turns, joints = _parts(coords, room, tangent)
     ends = jnp.clip(room.r + times(room.turning, joints), room.lower, room.upper)
-    moved = quat.mul(quat.inv(room.pose), quat.exp(ends))
     still = jnp.all(joints == 0.0, axis=-1, keepdims=True)
-    moved = jnp.where(still, jnp.eye(4, dtype=moved.dtype)[0], moved)
+    moved = jnp.where(still, jnp.eye(4, dtype=ends.dtype)[0], room.turning_to(ends))
     return coords.join_q(scalars, jnp.concatenate([quat.exp(turns), moved]))
 
 
@@ -135,9 +136,8 @@ def clip(coords: quat.Coordinates, room: Room, u: Array) -> Array:
     turns, joints = quats[: -len(room.r)], quats[-len(room.r) :]
     r = room.turned(joints)
     inside = jnp.clip(r, room.lower, room.upper)
-    moved = quat.mul(quat.inv(room.pose), quat.exp(inside))
     outside = _square(inside - r) > 1e-12
-    joints = jnp.where(outside, moved, joints)
+    joints = jnp.where(outside, room.turning_to(inside), joints)
     return coords.join_q(scalars, jnp.concatenate([turns, joints]))
 
 
@@ -159,6 +159,14 @@ def inverse_right_jacobian(r: Array) -> Array:
     eye = jnp.eye(3, dtype=r.dtype)
     cross = jnp.cross(r[:, None, :], eye).mT
     return eye + 0.5 * cross + c * (r[:, :, None] * r[:, None, :] - a2 * eye)
+
+
+def _parts(
+    coords: quat.Coordinates, room: Room, tangent: Array
+) -> tuple[Array, Array, Array]:
+    """Scalars [S], other turns [K - J, 3] and joints [J, 3] of a tangent [nv]."""
+    scalars, tangents = coords.split_v(tangent)
+    return scalars, tangents[: -len(room.r)], tangents[-len(room.r) :]
 
 
 def _shortened(used: Array) -> Array:
