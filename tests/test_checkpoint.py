@@ -96,7 +96,9 @@ def test_array_that_is_not_what_was_written_is_named(run_dir, monkeypatch):
 
 def test_checkpoint_of_an_older_version_is_refused_in_one_line(run_dir):
     (run_dir / "checkpoints" / "000000004.sha256").write_text("{}")
-    with pytest.raises(ValueError, match=r"000000004 was written by an older version"):
+    with pytest.raises(
+        checkpoint.CheckpointError, match="000000004 was written by an older"
+    ):
         checkpoint.restore_latest(run_dir, _state(0), _silent)
 
 
@@ -116,7 +118,9 @@ def test_state_of_another_meaning_is_refused(run_dir, monkeypatch):
         earlier.setattr(checkpoint, "_STATE_FORMAT", checkpoint._STATE_FORMAT - 1)
         checkpoint.save(run_dir, 6, _state(6), keep=3)
         assert checkpoint.restore_latest(run_dir, _state(0), _silent) is not None
-    with pytest.raises(ValueError, match=r"000000006 was written by an older version"):
+    with pytest.raises(
+        checkpoint.CheckpointError, match="000000006 was written by an older"
+    ):
         checkpoint.restore_latest(run_dir, _state(0), _silent)
 
 

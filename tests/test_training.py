@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from dcc_jax.training import checkpoint, logs, loop
+from dcc_jax.training.folder import RunError
 from toy import Toy
 from toy_run import INTERVAL, toy_config
 
@@ -117,7 +118,7 @@ def test_run_that_cannot_go_on_stays_as_it_is(tmp_path, monkeypatch):
         earlier.setattr(checkpoint, "_STATE_FORMAT", checkpoint._STATE_FORMAT - 1)
         loop.train(toy_config(2), run_dir=tmp_path, environment=Toy(), quiet=True)
     before = {p.name: p.read_bytes() for p in tmp_path.glob("*.*")}
-    with pytest.raises(ValueError, match="written by an older version"):
+    with pytest.raises(RunError, match="written by an older version"):
         loop.train(
             toy_config(4),
             run_dir=tmp_path,

@@ -14,8 +14,10 @@ from dcc_jax import quat
 from dcc_jax.character import CONTROL_DT, Character, asset_path
 from dcc_jax.control import pd
 from dcc_jax.control.controller import Displacement
+from dcc_jax.env import mechanics
 from dcc_jax.env.config import EnvConfig
 from dcc_jax.env.environment import Environment
+from dcc_jax.env.features import FEATURE_SIZE
 from dcc_jax.env.observation import ALPHA_ENTRY
 from dcc_jax.env.state import EnvState
 from dcc_jax.motion.clip import load_clip
@@ -181,6 +183,7 @@ def test_the_discriminator_sees_a_pose_without_all_that_forces_made_it_yield(
     whole = quat.exp_map(coords, jnp.asarray(y))
     u = quat.exp_map(coords, jnp.asarray(0.5 * y))
     gone = whole if pd_yields else u
+    slid = start.q_previous.at[0].add(0.003)
 
     def observed(u, y, away):
         q = scene.character_qpos(start.body.qpos)
@@ -191,7 +194,7 @@ def test_the_discriminator_sees_a_pose_without_all_that_forces_made_it_yield(
             dataclasses.replace(
                 start,
                 body=dataclasses.replace(start.body, qpos=qpos),
-                q_previous=quat.oplus(coords, start.q_previous, away),
+                q_previous=quat.oplus(coords, slid, away),
                 displacement=dataclasses.replace(start.displacement, u=u, y=y),
                 u_previous=u,
                 yield_previous=environment.yielded(Displacement(u=u, ud=y, y=y, yd=y)),
@@ -201,7 +204,17 @@ def test_the_discriminator_sees_a_pose_without_all_that_forces_made_it_yield(
     rest = quat.identity(coords)
     at_rest = observed(rest, jnp.zeros(coords.nv), rest)
     yielded = observed(u, jnp.asarray(y), gone)
-    np.testing.assert_allclose(yielded.features, at_rest.features, atol=2e-5)
+    np.testing.assert_allclose(
+        yielded.features[:FEATURE_SIZE], at_rest.features[:FEATURE_SIZE], atol=2e-5
+    )
+    # Soles slide where the character is, not where it would be.
+    now, before = scene.character_qpos(yielded.body.qpos), yielded.q_previous
+    np.testing.assert_allclose(
+        yielded.features[FEATURE_SIZE:],
+        mechanics.sliding(environment.mechanics, now, before),
+        atol=1e-6,
+    )
+    assert np.abs(yielded.features - at_rest.features)[FEATURE_SIZE:].min() > 0.03
     # The policy's own numbers have u taken off, as in the paper.
     apart = np.abs(yielded.obs[:270] - at_rest.obs[:270]).max()
     assert apart > 0.01 if pd_yields else apart < 1e-3

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from dcc_jax import quat
 from dcc_jax.character import Character, compose_scene, load_character
 from dcc_jax.env import mechanics
 from dcc_jax.env.mechanics import Mechanics
@@ -69,6 +70,32 @@ def test_only_soles_that_stood_and_stand_slip():
         jnp.array(now), jnp.array(before), jnp.array(-1.0), jnp.array(-1.0)
     )
     assert not stands and float(distance) == 0.0
+
+
+def test_sliding_is_the_speed_of_the_soles_that_stand_and_of_no_other(character):
+    tables = Mechanics.of(character)
+    stand = jnp.zeros(55).at[3::4].set(1.0)
+    lowest = jnp.min(mechanics.sole_points(tables, stand)[:, 2])
+    stand = stand.at[2].add(-lowest)
+
+    def sliding(now, before):
+        return np.asarray(mechanics.sliding(tables, now, before))
+
+    before = stand.at[:2].add(jnp.array([-0.003, -0.004]))
+    np.testing.assert_allclose(sliding(stand, before), 0.005 * 30.0, rtol=1e-3)
+    assert np.all(sliding(stand, stand) < 1e-4)
+    # Half of it is counted where both moments are TOUCH sqrt(log(2) / 2) too high.
+    up = mechanics.TOUCH * np.sqrt(np.log(2.0) / 2.0)
+    half = sliding(stand.at[2].add(up), before.at[2].add(up))
+    np.testing.assert_allclose(half, 0.075, rtol=1e-3)
+    lifted = sliding(stand.at[2].add(0.02), before)
+    assert np.all(lifted < 1e-6)
+    # The right hip bends: that foot is in the air, and the left one slides.
+    hip = 7 + 4 * character.joint_names.index("right_hip")
+    bent = quat.exp(jnp.array([0.0, -0.5, 0.0]))
+    raised = [q.at[hip : hip + 4].set(bent) for q in (stand, before)]
+    left, right = sliding(*raised)
+    assert left == pytest.approx(0.15, rel=1e-3) and right < 0.02
 
 
 def test_joint_outside_its_range_is_seen_by_as_much(character):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from types import SimpleNamespace
 
 import jax
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from dcc_jax.env.pairs import COLUMN_ARM, VELOCITY_TIME, pair_coordinates, weighed
+from dcc_jax.env.pairs import COLUMN_ARM, VELOCITY_TIME, pair_coordinates, seen, weighed
 from dcc_jax.learn import style
 from toy import Toy
 
@@ -86,12 +87,17 @@ def test_environments_that_were_just_reset_do_not_count():
     assert all(float(value) < 0.3 for value in measured.values())
 
 
-def _features(position: np.ndarray, before: np.ndarray, columns: np.ndarray):
-    """[270] of bodies at positions [15, 3] now and then, one turn for all [6]."""
+def _features(
+    position: np.ndarray,
+    before: np.ndarray,
+    columns: np.ndarray,
+    sliding: Sequence[float] = (0.0, 0.0),
+):
+    """[272] of bodies at positions [15, 3] now and then, one turn for all [6]."""
     turn = np.broadcast_to(columns, (15, 6))
     velocity = (position - before) / DT
     bodies = np.concatenate([position, velocity, turn, np.zeros((15, 6))], 1).ravel()
-    return weighed(jnp.array(bodies), TIME)
+    return seen(jnp.array(bodies), jnp.array(sliding), TIME)
 
 
 def test_pair_moved_as_a_whole_is_as_far_away():
@@ -122,11 +128,21 @@ def test_speed_and_turn_count_as_the_constants_say():
 
 def test_a_velocity_weighs_as_much_as_the_way_it_makes_in_that_time():
     bodies = np.ones((2, 15, 18), np.float32)
-    seen = np.asarray(weighed(jnp.array(bodies.reshape(2, 270)), TIME))
-    pos, velocity, columns, rate = np.split(seen.reshape(2, 15, 18), [3, 6, 12], axis=2)
+    values = np.asarray(weighed(jnp.array(bodies.reshape(2, 270)), TIME))
+    pos, velocity, columns, rate = np.split(
+        values.reshape(2, 15, 18), [3, 6, 12], axis=2
+    )
     assert np.all(pos == 1.0) and np.all(columns == 1.0)
     np.testing.assert_allclose(velocity, TIME)
     np.testing.assert_allclose(rate, TIME)
+
+
+def test_sliding_soles_are_seen_and_are_no_distance():
+    at, turn = np.zeros((15, 3)), np.zeros(6)
+    still, slides = _features(at, at, turn), _features(at, at, turn, (0.2, 0.1))
+    np.testing.assert_allclose(slides - still, [*[0.0] * 270, 0.2, 0.1], atol=1e-7)
+    one = pair_coordinates(still, still, TIME)
+    np.testing.assert_array_equal(pair_coordinates(slides, slides, TIME), one)
 
 
 def test_floor_is_the_distance_of_other_pairs_of_the_clips(reference):

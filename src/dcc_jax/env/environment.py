@@ -20,6 +20,7 @@ from dcc_jax.control import compliance
 from dcc_jax.env import (
     expert,
     features,
+    mechanics,
     metrics,
     observation,
     outcome,
@@ -27,6 +28,7 @@ from dcc_jax.env import (
     rewards,
 )
 from dcc_jax.env.config import EnvConfig
+from dcc_jax.env.mechanics import Mechanics
 from dcc_jax.env.state import ControlInputs, EnvState, Substep, terminate_on_nonfinite
 from dcc_jax.env.substep import Side, physics_step
 from dcc_jax.env.task import Forces, RootTarget, Task
@@ -71,8 +73,8 @@ class Environment:
         self.scene = physics.make_scene(
             model, character, newton_iterations=config.newton_iterations
         )
-        alone = compose_scene(character, floor=False)
-        self.kinematics = features.Kinematics.of(alone)
+        self.mechanics = Mechanics.of(character)
+        self.kinematics = self.mechanics.kinematics
         self.nominal = jax.jit(expert.nominal_pose)(references)
         self.controller = compliance.Controller.of(
             config.compliance, character, self.kinematics.coords, self.scene.timestep
@@ -81,7 +83,7 @@ class Environment:
         self.expert_lead = expert.lead(character, CONTROL_DT)
         self.action_size = character.num_joint_dofs + task.extra_actions
         self.observation_size = observation.size(task, self.has_phase)
-        self.feature_size = features.FEATURE_SIZE
+        self.feature_size = pairs.SEEN_SIZE
         self.has_task_reward = task.has_reward
         # Traced once, however many programs have it.
         self._reset = jax.jit(self._begun)
@@ -218,10 +220,10 @@ class Environment:
         return terminate_on_nonfinite(self._judged(self.observed(new)), state)
 
     def expert_pairs(self, key: Array, spans: Array) -> tuple[Array, Array, Array]:
-        """(s, s') ~ M, `spans` [n] control steps apart: features [n, 270] twice, and
-        the condition [n, C]."""
+        """(s, s') ~ M, `spans` [n] control steps apart: what the discriminator sees
+        [n, 272] twice, and the condition [n, C]."""
         s, s_next, phase = expert.pairs(
-            self.kinematics, self.references, key, spans, self.config.velocity_time
+            self.mechanics, self.references, key, spans, self.config.velocity_time
         )
         condition = jax.vmap(observation.of_phase)(phase)
         return s, s_next, condition[:, : self.condition_size]
@@ -236,7 +238,7 @@ class Environment:
         return jnp.pad(turn, (0, task.extra_actions))
 
     def style_coordinates(self, s: Array, s_next: Array) -> Array:
-        """Pairs of features [..., 270] as points [..., 225] in m (`learn.style`)."""
+        """Pairs of what is seen [..., 272] as points [..., 225] in m."""
         return pairs.pair_coordinates(s, s_next, self.config.velocity_time)
 
     def _drawn(self, key: Array, place_key: Array) -> tuple[RefState, RefState]:
@@ -297,14 +299,18 @@ class Environment:
             self._root_target(state),
             self.has_phase,
         )
+        q = self.scene.character_qpos(state.body.qpos).at[2].add(-self._ground(state))
+        before = state.q_previous.at[2].add(-state.ground_previous)
         bodies = features.unyielded(
             self.kinematics,
-            self.scene.character_qpos(state.body.qpos).at[2].add(-self._ground(state)),
-            state.q_previous.at[2].add(-state.ground_previous),
+            q,
+            before,
             self.yielded(state.displacement),
             state.yield_previous,
         )
-        seen = pairs.weighed(bodies, self.config.velocity_time)
+        # Soles must not slide, however far the pose gives way: q, not q (-) u.
+        sliding = mechanics.sliding(self.mechanics, q, before)
+        seen = pairs.seen(bodies, sliding, self.config.velocity_time)
         first = state.time == 0.0
         return dataclasses.replace(
             state,

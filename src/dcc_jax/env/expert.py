@@ -11,30 +11,32 @@ import numpy as np
 
 from dcc_jax import quat
 from dcc_jax.character import Character
-from dcc_jax.env import features
+from dcc_jax.env import features, mechanics
 from dcc_jax.env.features import Kinematics
-from dcc_jax.env.pairs import weighed
+from dcc_jax.env.mechanics import Mechanics
+from dcc_jax.env.pairs import seen
 from dcc_jax.motion.reference import References
 
 Array = jax.Array
 
 
 def pairs(
-    kinematics: Kinematics,
+    tables: Mechanics,
     references: References,
     key: Array,
     spans: Array,
     velocity_time: float,
 ) -> tuple[Array, Array, Array]:
-    """(s, s') ~ M: the features [n, 270] of clips, now and `spans` [n] control steps
+    """(s, s') ~ M: what is `seen` [n, 272] of clips, now and `spans` [n] control steps
     later, and the clip's phase [n] then."""
     windows, phase = references.sample_windows(key, spans)
 
-    def seen(q: Array, before: Array) -> Array:
-        bodies = features.body_features(kinematics, q, before)
-        return weighed(bodies, velocity_time)
+    def of_pose(q: Array, before: Array) -> Array:
+        bodies = features.body_features(tables.kinematics, q, before)
+        sliding = mechanics.sliding(tables, q, before)
+        return seen(bodies, sliding, velocity_time)
 
-    pair = jax.vmap(seen)
+    pair = jax.vmap(of_pose)
     s, s_next = pair(windows[:, 1], windows[:, 0]), pair(windows[:, 3], windows[:, 2])
     return s, s_next, phase
 

@@ -14,7 +14,14 @@ import mujoco
 import numpy as np
 
 from dcc_jax import quat
-from dcc_jax.character import GRAVITY, Character, compose_scene, sole_names
+from dcc_jax.character import (
+    CONTROL_DT,
+    FEET,
+    GRAVITY,
+    Character,
+    compose_scene,
+    sole_names,
+)
 from dcc_jax.env import features
 from dcc_jax.env.features import Kinematics
 
@@ -107,6 +114,25 @@ def slip(
     distance = jnp.sqrt(jnp.sum(moved**2, axis=-1) + 1e-12)
     count = jnp.sum(stands)
     return jnp.sum(stands * distance) / jnp.maximum(count, 1), count > 0
+
+
+def sliding(mechanics: Mechanics, q: Array, q_previous: Array) -> Array:
+    """How fast what stands of each foot slides over the ground, [2] m/s.
+
+    The mean over the spheres of a foot, of which each counts by how near to the ground
+    it is at both moments: all of it on the ground and below, 14 % `TOUCH` above.
+
+    Args:
+        mechanics: of the character.
+        q: now [55], its height above the ground.
+        q_previous: the same, one control step ago.
+    """
+    now, before = sole_points(mechanics, q), sole_points(mechanics, q_previous)
+    height = jnp.maximum(jnp.stack([now[:, 2], before[:, 2]]), 0.0)
+    stands = jnp.exp(-jnp.sum((height / TOUCH) ** 2, axis=0))
+    moved = now[:, :2] - before[:, :2]
+    distance = jnp.sqrt(jnp.sum(moved**2, axis=-1) + 1e-12)
+    return jnp.mean((stands * distance).reshape(len(FEET), -1), axis=1) / CONTROL_DT
 
 
 def range_excess(mechanics: Mechanics, q: Array) -> Array:

@@ -6,13 +6,30 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dcc_jax.character import BODIES
-from dcc_jax.env.features import BODY_FEATURE_SIZE
+from dcc_jax.character import BODIES, FEET
+from dcc_jax.env.features import BODY_FEATURE_SIZE, FEATURE_SIZE
 
 Array = jax.Array
 
 COLUMN_ARM = 0.1  # m; a body turned by 1 rad is about 0.14 m away
 VELOCITY_TIME = 0.1  # s; a body faster by 1 m/s is 0.1 m away
+
+SEEN_SIZE = FEATURE_SIZE + len(FEET)
+"""Numbers that the discriminator sees of a state, 272."""
+
+
+def seen(bodies: Array, sliding: Array, velocity_time: float) -> Array:
+    """What the discriminator sees of a state, [..., 272].
+
+    Departure: the paper has the bodies alone. There a sole that slides at 10 cm/s is
+    less than can be told apart, but the eye sees it.
+
+    Args:
+        bodies: `body_features` [..., 270].
+        sliding: of both feet, `mechanics.sliding` [..., 2] m/s.
+        velocity_time: of `weighed`, s.
+    """
+    return jnp.concatenate([weighed(bodies, velocity_time), sliding], axis=-1)
 
 
 def weighed(bodies: Array, velocity_time: float) -> Array:
@@ -27,19 +44,21 @@ def weighed(bodies: Array, velocity_time: float) -> Array:
 
 
 def pair_coordinates(s: Array, s_next: Array, velocity_time: float) -> Array:
-    """A pair of `weighed` features as a point [..., 225] in m, by Euclidean distance.
+    """A pair of what is `seen` as a point [..., 225] in m, by Euclidean distance.
 
     A body contributes its position, its two columns times `COLUMN_ARM`, and its
     velocity in s' and in s times `VELOCITY_TIME`. All is divided by the root of the
     number of bodies: the distance of two points is a root mean square over the bodies.
 
     Args:
-        s: [..., 270].
-        s_next: [..., 270], a control step later.
+        s: [..., 272] of `seen`; how the soles slide is left out.
+        s_next: [..., 272], a control step later.
         velocity_time: of both, s.
     """
-    before = s.reshape(*s.shape[:-1], -1, BODY_FEATURE_SIZE)
-    now = s_next.reshape(*s_next.shape[:-1], -1, BODY_FEATURE_SIZE)
+    before, now = (
+        x[..., :FEATURE_SIZE].reshape(*x.shape[:-1], -1, BODY_FEATURE_SIZE)
+        for x in (s, s_next)
+    )
     parts = [
         now[..., 0:3],
         COLUMN_ARM * now[..., 6:12],

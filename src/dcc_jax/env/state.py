@@ -24,8 +24,8 @@ class EnvState:
     """Everything that ONE environment carries, and what the learner reads of it."""
 
     obs: Array  # [O]
-    features: Array  # [270] s' of the discriminator
-    previous_features: Array  # [270] s
+    features: Array  # [272] s' of the discriminator
+    previous_features: Array  # [272] s
     condition: Array  # [C] the discriminator's, beside the features
     r_q: Array  # [] where the clip is followed in time, else 0
     r_p: Array  # []

@@ -19,7 +19,6 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 from dcc_jax.env.config import CONTROL_RATE
 from dcc_jax.env.environment import Environment
-from dcc_jax.env.mechanics import Mechanics
 from dcc_jax.env.state import EnvState
 from dcc_jax.learn.rollout import Policy
 from dcc_jax.play import stepping
@@ -37,8 +36,7 @@ class Player:
 
     def __init__(self, environment: Environment) -> None:
         self.environment = environment
-        tables = Mechanics.of(environment.scene.character)
-        self._step = partial(stepping.advance, environment, tables)
+        self._step = partial(stepping.advance, environment)
         devices = jax.devices()
         self._mesh = jax.make_mesh((len(devices),), ("env",), devices=devices)
         shared, split = PartitionSpec(), PartitionSpec("env")

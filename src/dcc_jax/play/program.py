@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from dcc_jax.env.environment import Environment
-from dcc_jax.env.mechanics import Mechanics
 from dcc_jax.env.state import EnvState
 from dcc_jax.env.task import Task
 from dcc_jax.play import stepping
@@ -36,7 +35,6 @@ class Program:
             changes = {f"task.{name}": value for name, value in (task or {}).items()}
             task = run.config.with_(changes).task
         self.environment: Environment = make_environment(run, Pulled(task))
-        self._tables = Mechanics.of(self.environment.scene.character)
         self._compiled: tuple[Any, Any] | None = None
 
     @property
@@ -71,7 +69,7 @@ class Program:
         key, alpha = stepping.episode_key(0, 0), jnp.zeros(())
         reset = jax.jit(partial(stepping.begin, self.environment))
         shapes = jax.eval_shape(reset, key, alpha)
-        step = jax.jit(partial(stepping.advance, self.environment, self._tables))
+        step = jax.jit(partial(stepping.advance, self.environment))
         self._compiled = (
             reset.lower(key, alpha).compile(),
             step.lower(run.policy, shapes, key, alpha, jnp.zeros((), int)).compile(),

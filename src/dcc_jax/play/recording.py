@@ -17,7 +17,6 @@ import numpy as np
 from dcc_jax import physics, quat
 from dcc_jax.env import mechanics
 from dcc_jax.env.environment import Environment
-from dcc_jax.env.mechanics import Mechanics
 from dcc_jax.env.state import EnvState
 from dcc_jax.env.task import Forces
 
@@ -63,7 +62,6 @@ class Recording:
 
 def frame(
     environment: Environment,
-    tables: Mechanics,
     before: EnvState,
     state: EnvState,
     forces: Forces,
@@ -72,13 +70,12 @@ def frame(
 
     Args:
         environment: of the episode.
-        tables: of its character.
         before: the state at the beginning of the control step.
         state: at its end.
         forces: of its physics steps, leaves [S, ...].
     """
     return Frame(
-        numbers=_numbers(environment, tables, before, state),
+        numbers=_numbers(environment, before, state),
         motion=_motion(environment, state, forces),
         terminated=state.terminated,
         truncated=state.truncated,
@@ -87,10 +84,10 @@ def frame(
 
 
 def _numbers(
-    environment: Environment, tables: Mechanics, before: EnvState, state: EnvState
+    environment: Environment, before: EnvState, state: EnvState
 ) -> dict[str, Array]:
     """Everything of a control step that is one number; `measures` sums them up."""
-    scene, task = environment.scene, environment.task
+    scene, task, tables = environment.scene, environment.task, environment.mechanics
     q = scene.character_qpos(state.body.qpos)
     kinetic, potential = mechanics.energy(
         tables, q, scene.character_qvel(state.body.qvel)

@@ -11,7 +11,6 @@ from typing import Any
 import jax
 
 from dcc_jax.env.environment import Environment
-from dcc_jax.env.mechanics import Mechanics
 from dcc_jax.env.observation import ALPHA_ENTRY
 from dcc_jax.env.state import EnvState
 from dcc_jax.learn.rollout import Policy
@@ -33,7 +32,6 @@ def begin(environment: Environment, key: Array, alpha: Array) -> EnvState:
 
 def advance(
     environment: Environment,
-    tables: Mechanics,
     policy: Policy,
     state: EnvState,
     key: Array,
@@ -44,7 +42,6 @@ def advance(
 
     Args:
         environment: of the episode.
-        tables: of its character.
         policy: acts by its mean.
         state: before the step.
         key: of the episode; not consumed.
@@ -54,4 +51,4 @@ def advance(
     obs = state.obs.at[ALPHA_ENTRY].set(observed_alpha)
     draws = jax.random.fold_in(key, count)
     new, forces = environment.recorded_step(draws, state, policy.mean(obs))
-    return new, recording.frame(environment, tables, state, new, forces)
+    return new, recording.frame(environment, state, new, forces)

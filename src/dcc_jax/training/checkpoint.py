@@ -14,7 +14,7 @@ import shutil
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn, cast
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ from dcc_jax.learn.rollout import Policy
 
 _FOLDER = "checkpoints"
 _DIGITS = 9  # of an update in the name of its checkpoint
-_STATE_FORMAT = 4
+_STATE_FORMAT = 5
 _POLICY_FORMAT = 3
 """Raised when their arrays come to mean something else. 3: discriminator and policy see
 velocities. 4: a state holds the averaged policy."""
@@ -88,22 +88,22 @@ def restore_latest(
         say: told about every damaged checkpoint that is passed over.
 
     Raises:
-        CheckpointError: there are checkpoints, and all are damaged.
-        ValueError: the state has another shape than the template, or an older version
-            of this package wrote the checkpoint.
+        CheckpointError: there are checkpoints, and all are damaged, or an older version
+            of this package wrote the newest.
+        ValueError: the state has another shape than the template.
     """
     updates = available(run_dir)
     for update in updates:
         path = _path(run_dir, update)
         if path.with_name(f"{path.name}.sha256").exists():
-            _refuse(path)
+            raise CheckpointError(_older(path))
         try:
             arrays = _read(run_dir, update)
         except CheckpointError as error:
             say(f"skipping damaged checkpoint {path}: {error}")
             continue
         if arrays.pop("format", None) != _STATE_FORMAT:
-            _refuse(path)
+            raise CheckpointError(_older(path))
         return update, from_arrays(arrays, template)
     if updates:
         raise CheckpointError(f"every checkpoint in {run_dir / _FOLDER} is damaged")
@@ -184,7 +184,7 @@ def load_policy(directory: Path) -> Policy:
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path} is damaged: {error}") from None
     if arrays.get("format") != _POLICY_FORMAT:
-        _refuse(path)
+        raise ValueError(_older(path))
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(policy)):
         raise ValueError(f"{path} is damaged: some of its numbers are not finite")
     return policy
@@ -260,8 +260,8 @@ def _digests(arrays: dict[str, np.ndarray]) -> dict[str, str]:
     }
 
 
-def _refuse(path: Path) -> NoReturn:
-    raise ValueError(
+def _older(path: Path) -> str:
+    return (
         f"{path} was written by an older version of dcc_jax, whose runs hold other "
         "numbers; train it again"
     )
