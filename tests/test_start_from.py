@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dcc_jax import sweep
-from dcc_jax.learn import learner, update
+from dcc_jax.learn import learner
 from dcc_jax.training import checkpoint, loop
 from toy import Toy
 from toy_run import toy_config
@@ -77,13 +77,12 @@ def test_every_run_of_a_sweep_begins_with_it(first, tmp_path):
         _same(policy.params, begun.params)
 
 
-def test_policy_waits_for_the_value_function(first, tmp_path, monkeypatch):
-    monkeypatch.setattr(update, "VALUE_FIRST", 2)
+def test_policy_waits_for_the_value_function(first, tmp_path):
     begun = checkpoint.load_policy(first)
 
     def after(updates: int):
         run_dir = tmp_path / f"{updates}"
-        config = _config(updates, first)
+        config = _config(updates, first, policy_waits=2)
         loop.train(config, run_dir=run_dir, environment=Toy(), quiet=True)
         return checkpoint.load_policy(run_dir).params
 

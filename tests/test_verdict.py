@@ -18,6 +18,11 @@ def test_nothing_is_said_before_anything_is_measured():
     assert verdict([{"update": 1.0}]) == ""
 
 
+def test_a_measurement_of_environments_that_were_just_reset_is_left_out():
+    rows = [*_rows([0.02, 0.01]), {"style/nearest": None, "style/floor": 0.004}]
+    assert verdict(rows) == "the motion is 10 mm away from its clips"
+
+
 @pytest.mark.parametrize(
     ("nearest", "trend"),
     [

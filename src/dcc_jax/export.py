@@ -77,8 +77,6 @@ def _played(options: Options) -> Clip:
     """What the policy does in its first episode."""
     if not 0.1 <= options.seconds <= 3600.0:
         raise ValueError(f"seconds must be in [0.1, 3600], got {options.seconds}")
-    if options.alpha is not None and not 0.0 <= options.alpha <= 1.0:
-        raise ValueError(f"alpha must be in [0, 1], got {options.alpha}")
     command.start_jax()
     import numpy as np
 
@@ -88,6 +86,8 @@ def _played(options: Options) -> Clip:
     from dcc_jax.play.runs import find_run, make_environment
 
     run = find_run(options.source)
+    if options.alpha is not None:
+        run.config.env.compliance.check_alpha(options.alpha)
     environment = make_environment(run)
     alpha = run.alphas[1] if options.alpha is None else options.alpha
     recording = Player(environment).play(

@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 
 from dcc_jax import quat
-from dcc_jax.character import CONTROL_DT, Character, asset_path
+from dcc_jax.character import BODIES, CONTROL_DT, Character, asset_path
 from dcc_jax.control import pd
 from dcc_jax.control.controller import Displacement
-from dcc_jax.env import mechanics
+from dcc_jax.env import features, mechanics
 from dcc_jax.env.config import EnvConfig
 from dcc_jax.env.environment import Environment
 from dcc_jax.env.features import FEATURE_SIZE
 from dcc_jax.env.observation import ALPHA_ENTRY
+from dcc_jax.env.outcome import FallTest
 from dcc_jax.env.state import EnvState
 from dcc_jax.motion.clip import load_clip
 from dcc_jax.motion.reference import make_references
@@ -89,9 +90,26 @@ def test_a_hand_on_the_ground_is_a_fall_though_the_pelvis_is_high(environment):
 
 
 def test_the_time_runs_out(start, step):
-    late = dataclasses.replace(start, time=jnp.array(2.0 - 1.5 * CONTROL_DT))
+    late = dataclasses.replace(start, time=jnp.array(2.0 - 2.0 * CONTROL_DT))
     assert not step(late).truncated
     assert step(dataclasses.replace(late, time=late.time + CONTROL_DT)).truncated
+    # The time is of whole control steps, whatever float32 lost on the way.
+    lost = dataclasses.replace(late, time=late.time + CONTROL_DT - 1e-3)
+    assert step(lost).truncated and step(lost).time == 2.0
+
+
+def test_a_clip_that_goes_to_the_floor_is_no_fall(character):
+    """A pose of the clip has a hand at 3 cm: a hand may be lower by 5 cm, to -2 cm."""
+    clip = load_clip(asset_path("motions/stand.npz"))
+    hand = BODIES.index("left_hand")
+    skeleton = features.skeleton()
+    height = float(features.body_poses(skeleton, clip.qpos[0])[0][hand, 2])
+    qpos = clip.qpos.copy()
+    qpos[:, 2] += 0.03 - height
+    low = dataclasses.replace(clip, qpos=qpos)
+    test, usual = (FallTest.of(CONFIG, make_references([c])) for c in (low, clip))
+    assert test.clearance < 0.03 - 0.049
+    assert usual.clearance == CONFIG.limb_clearance
 
 
 def test_a_number_that_is_not_finite_ends_the_episode_and_goes_no_further(start, step):

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from dcc_jax import config, tasks
-from dcc_jax.env.observation import ALPHA_ENTRY, PHASE_SIZE
+from dcc_jax import config, quat, tasks
+from dcc_jax.character import CONTROL_DT
+from dcc_jax.env.observation import ALPHA_ENTRY, PHASE_SIZE, POSE_SIZE
 from dcc_jax.play import runs
 from dcc_jax.play.runs import find_run
 
 PHASE = slice(ALPHA_ENTRY + 1, ALPHA_ENTRY + 1 + PHASE_SIZE)
+POSE = slice(PHASE.stop, PHASE.stop + POSE_SIZE)
 
 
 def make(task: str, imitation: str):
@@ -61,6 +66,42 @@ def test_the_discriminator_is_given_the_phase_that_the_policy_observes(door):
     phases = [float(state.reference.phase) for state in states]
     assert phases[0] < phases[1] < phases[2]
     np.testing.assert_allclose(states[-1].condition[0], phases[-1])
+
+
+def test_the_policy_observes_the_pose_that_its_action_is_an_offset_from():
+    """Against scipy: the pose one control step ahead, from the nominal one; its root
+    from the character's."""
+    environment = make("door", "tracking")
+    state = jax.jit(environment.reset)(jax.random.key(2))
+    observed = jax.jit(environment.observed)
+    tilt = jnp.array([np.cos(0.1), 0.0, np.sin(0.1), 0.0])  # 0.2 rad about y
+    q = environment.scene.character_qpos(state.body.qpos)
+    assert environment.scene.qpos_adr == 0
+    qpos = state.body.qpos.at[3:7].set(quat.mul(q[3:7], tilt))
+    body = dataclasses.replace(state.body, qpos=qpos)
+    seen = np.asarray(observed(dataclasses.replace(state, body=body)).obs[POSE])
+    ahead = environment.references.qpos_at(0, state.reference.time + CONTROL_DT)
+    assert seen[0] == pytest.approx(float(ahead[2]), abs=1e-6)
+
+    def turns(pose):
+        quats = np.asarray(pose)[3:].reshape(13, 4)
+        return Rotation.from_quat(quats, scalar_first=True)
+
+    joints = turns(environment.nominal)[1:].inv() * turns(ahead)[1:]
+    np.testing.assert_allclose(seen[4:], joints.as_rotvec().ravel(), atol=1e-5)
+    assert np.abs(seen[4:]).max() > 0.1
+    root = turns(qpos[: q.size])[0].inv() * turns(ahead)[0]
+    np.testing.assert_allclose(seen[1:4], root.as_rotvec(), atol=1e-5)
+    assert seen[2] == pytest.approx(-0.2, abs=0.02)
+
+
+def test_the_paper_observes_the_phase_alone():
+    with_pose = make("door", "tracking")
+    run = config.make_config("door", "paper")
+    assert not run.env.observe_reference
+    alone = tasks.make_environment(run.task, run.env)
+    assert with_pose.observation_size - alone.observation_size == POSE_SIZE
+    assert not make("push", "task").has_pose
 
 
 def test_the_clips_come_with_their_phase(door):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +17,7 @@ from dcc_jax.control.stiffness import softened_gains, stiffness
 from dcc_jax.evaluate import drag, rest, show_drag
 from dcc_jax.evaluate.dragging import BODIES, DIRECTIONS, NEWTONS, Trials
 from dcc_jax.motion.clip import load_clip
+from dcc_jax.play.runs import find_run
 
 CHARACTER = load_character()
 MODEL = compose_scene(CHARACTER, floor=False)
@@ -154,6 +156,30 @@ def test_a_trial_that_falls_at_one_level_counts_for_the_slope_at_none():
     drags[1].measured[fallen] = np.nan
     drags[0].measured[fallen] = 1e-3
     assert drag.slope(drags, "left_hand") == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_body_that_balance_moves_against_the_force_is_stiffer_than_all_others():
+    """Two of five trials at the head yield backwards, by balance: the median is of the
+    stiffest that yields."""
+    found = measured(0.5)
+    head = found.at("head")
+    found.measured[head] = np.resize([-9e4, -5e3, 4e3, 2e3, 1e3], len(head))
+    assert found.stiffness("head").value == pytest.approx(4e3)
+    assert found.stiffness("head").low <= 4e3
+
+
+def test_levels_are_those_of_the_training_where_it_had_none_of_the_usual():
+    run = find_run("push")
+    config = run.config.with_({"env.alpha": 0.2, "env.alpha_max": 0.25})
+    run = dataclasses.replace(run, config=config)
+    assert drag.prepare(run, None, 1, 0, None).alpha == [0.2, 0.25]
+    with pytest.raises(ValueError, match="alpha must hold a level"):
+        drag.prepare(run, [], 1, 0, None)
+
+
+def test_a_clip_that_ends_before_the_force_is_refused():
+    with pytest.raises(ValueError, match=r"a drag lasts 7 s, and the clip backflip"):
+        drag.prepare(find_run("backflip"), None, 1, 0, None)
 
 
 def test_a_law_without_a_static_stiffness_is_refused():

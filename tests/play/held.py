@@ -58,7 +58,7 @@ def held_run() -> Run:
         }
     )
     policy = find_run("push").policy
-    size = observation.size(Held(), has_phase=False)
+    size = observation.size(Held(), has_phase=False, has_pose=False)
 
     def shortened(leaf: jax.Array) -> np.ndarray:
         own = policy.normalizer.mean.shape[0]

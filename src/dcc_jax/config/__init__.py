@@ -28,7 +28,7 @@ class Config:
 
     preset: Preset = "cpu"
     """Where the defaults below come from: `smoke` runs every part in seconds, `cpu` and
-    `gpu` have the batches for that hardware, `paper` has the paper's numbers (Sec. 5.1)."""
+    `gpu` have batches for that hardware, `paper` has the paper's numbers (Sec. 5.1)."""
 
     seed: int = 0
     """Of everything that is drawn; the same seed gives the same run."""

@@ -19,6 +19,7 @@ _SMOKE = {
     "train.unroll_length": 8,
     "train.total_tuples": 4 * 16 * 8,
     "train.warm_start_steps": 20,
+    "train.policy_waits": 1,
     "train.checkpoint_interval": 2,
 }
 
@@ -41,6 +42,7 @@ _GPU = {
     "disc.minibatch_size": 2048,
     "train.num_envs": 4096,
     "train.averaged_updates": 10,
+    "train.policy_waits": 10,
     "train.total_tuples": 80_000_000,
 }
 
@@ -50,6 +52,7 @@ _GPU = {
 _PAPER = {
     "env.compliance.law": "algorithm_1",
     "env.physics_rate": 600,
+    "env.observe_reference": False,
     "ppo.value_learning_rate": 1e-5,
     "ppo.target_kl": None,
     "ppo.minibatch_size": 128,

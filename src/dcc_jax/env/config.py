@@ -53,7 +53,7 @@ class EnvConfig:
 
     limb_clearance: float = 0.10
     """m; a body other than shins and feet whose origin comes so close to the ground has
-    touched it."""
+    touched it. Where a clip goes lower, it may be lower by 0.05 m than any clip."""
 
     clips: tuple[str, ...] = ()
     """Clips `*.npz`, motion files such as `*.bvh`, which are imported, or names of the
@@ -63,6 +63,10 @@ class EnvConfig:
     """What r_q is: `adversarial`, the discriminator's score, Eq. (13); `tracking`, the
     distance to the reference's pose, of which actions are then offsets; or what the
     `task` says."""
+
+    observe_reference: bool = True
+    """The policy observes the pose that it tracks, a control step ahead; without, its
+    phase alone, as in the paper. Says nothing where no pose is tracked."""
 
     velocity_time: float = CONTROL_DT
     """s; 1 m/s counts as much as this many m in what the discriminator sees. A small

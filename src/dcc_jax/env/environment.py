@@ -32,6 +32,7 @@ from dcc_jax.env.mechanics import Mechanics
 from dcc_jax.env.state import ControlInputs, EnvState, Substep, terminate_on_nonfinite
 from dcc_jax.env.substep import Side, physics_step
 from dcc_jax.env.task import Forces, RootTarget, Task
+from dcc_jax.motion.paths import whole_steps
 from dcc_jax.motion.reference import References, RefState
 
 Array = jax.Array
@@ -59,6 +60,7 @@ class Environment:
         self.has_phase = self.tracks_reference or (
             self.follows_reference and task.conditions_on_phase
         )
+        self.has_pose = self.tracks_reference and config.observe_reference
         conditioned = self.has_phase and not self.tracks_reference
         self.condition_size = observation.PHASE_SIZE if conditioned else 0
         self.config = config
@@ -82,7 +84,7 @@ class Environment:
         self.fallen = outcome.FallTest.of(config, references)
         self.expert_lead = expert.lead(character, CONTROL_DT)
         self.action_size = character.num_joint_dofs + task.extra_actions
-        self.observation_size = observation.size(task, self.has_phase)
+        self.observation_size = observation.size(task, self.has_phase, self.has_pose)
         self.feature_size = pairs.SEEN_SIZE
         self.has_task_reward = task.has_reward
         # Traced once, however many programs have it.
@@ -201,7 +203,7 @@ class Environment:
             body=end.body,
             displacement=end.displacement,
             task=end.task,
-            time=end.time,
+            time=whole_steps(end.time),
             reference=inputs.reference,
             q_previous=self.scene.character_qpos(state.body.qpos),
             u_previous=state.displacement.u,
@@ -298,6 +300,7 @@ class Environment:
             state,
             self._root_target(state),
             self.has_phase,
+            self._pose_ahead(state),
         )
         q = self.scene.character_qpos(state.body.qpos).at[2].add(-self._ground(state))
         before = state.q_previous.at[2].add(-state.ground_previous)
@@ -321,6 +324,14 @@ class Environment:
             ],
             previous_features=jnp.where(first, seen, state.previous_features),
         )
+
+    def _pose_ahead(self, state: EnvState) -> Array:
+        """What the policy observes of the pose to track, one control step ahead."""
+        if not self.has_pose:
+            return jnp.zeros(0)
+        ahead = self._following(state.reference, state.task)
+        q = self.scene.character_qpos(state.body.qpos)
+        return observation.of_pose(self.kinematics, q, ahead.qpos, self.nominal)
 
     def _ground(self, state: EnvState) -> Array:
         return self.task.ground_height(self.scene, state.task, state.body)

@@ -22,8 +22,8 @@ class Metrics:
     there are none. Torques include the stable PD's implicit damping term.
     """
 
-    force_peak: Array  # [] N, largest norm of all forces together
-    impulse: Array  # [] N s, integral of that norm
+    force_peak: Array  # [] N, largest sum of the norms of all forces
+    impulse: Array  # [] N s, integral of that sum
     contact_share: Array  # [] share of the physics steps in which a force acts
     torque_rms: Array  # [] N m, over the joints' axes and the physics steps
     contact_torque: Array  # [] N m, the same over the steps in which a force acts
@@ -74,7 +74,7 @@ def add(sums: Sums, force: Array, torque: Array, speed: Array, h: float) -> Sums
         h: physics step, s.
     """
     acts = acting(force)
-    size = jnp.where(acts, jnp.sqrt(jnp.sum(jnp.square(force)) + 1e-12), 0.0)
+    size = jnp.sum(jnp.sqrt(jnp.sum(jnp.square(force), axis=-1)))
     square = jnp.mean(jnp.square(torque))
     return Sums(
         force_peak=jnp.maximum(sums.force_peak, size),

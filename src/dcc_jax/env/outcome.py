@@ -9,10 +9,11 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from dcc_jax import quat
-from dcc_jax.character import BODIES
+from dcc_jax.character import BODIES, compose_scene, load_character
 from dcc_jax.env import features, rewards
 from dcc_jax.env.config import EnvConfig
 from dcc_jax.env.features import Kinematics
@@ -22,6 +23,7 @@ from dcc_jax.motion.reference import References, RefState
 Array = jax.Array
 
 CROUCH_MARGIN = 0.1  # m, by which the pelvis may be lower than in the clips
+LIMB_MARGIN = 0.05  # m, likewise a limb
 LIMBS = np.array([not name.endswith(("foot", "shin")) for name in BODIES])
 """Bodies that have no business on the ground."""
 
@@ -36,9 +38,10 @@ class FallTest:
     @classmethod
     def of(cls, config: EnvConfig, references: References) -> FallTest:
         """As configured, but no stricter than the clips themselves are."""
-        lowest = float(references.qpos[..., 2].min())
+        poses = np.asarray(references.qpos).reshape(-1, references.qpos.shape[-1])
         return cls(
-            min(config.fall_height, lowest - CROUCH_MARGIN), config.limb_clearance
+            min(config.fall_height, float(poses[:, 2].min()) - CROUCH_MARGIN),
+            min(config.limb_clearance, _lowest_limb(poses) - LIMB_MARGIN),
         )
 
     def __call__(self, kinematics: Kinematics, q: Array, ground: Array) -> Array:
@@ -46,6 +49,17 @@ class FallTest:
         pos_w, _ = features.body_poses(kinematics, q)
         touches = pos_w[LIMBS, 2] < ground + self.clearance
         return (q[2] < ground + self.pelvis) | jnp.any(touches)
+
+
+def _lowest_limb(poses: np.ndarray) -> float:
+    """The least height of `LIMBS` in poses [N, 55], m, by every fourth of them."""
+    model = compose_scene(load_character(), floor=False)
+    data, lowest = mujoco.MjData(model), np.inf
+    for pose in poses[::4]:
+        data.qpos[:] = pose
+        mujoco.mj_kinematics(model, data)
+        lowest = min(lowest, float(data.xpos[1:][LIMBS, 2].min()))
+    return lowest
 
 
 def tracking(

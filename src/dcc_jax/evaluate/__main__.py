@@ -117,6 +117,8 @@ def _plan_drag(options: Options) -> command.Work:
 
     if len(options.run_dir) != 1:
         raise ValueError(f"--drag takes one RUN_DIR, got {len(options.run_dir)}")
+    if options.seconds is not None or not options.control:
+        raise ValueError("--seconds and --no-control do nothing with --drag")
     run = find_run(options.run_dir[0])
     plan = drag.prepare(
         run,

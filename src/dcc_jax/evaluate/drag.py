@@ -22,7 +22,7 @@ from dcc_jax.character import CONTROL_RATE, Character
 from dcc_jax.env.environment import Environment
 from dcc_jax.evaluate import bootstrap, rest
 from dcc_jax.evaluate.bootstrap import Interval
-from dcc_jax.evaluate.dragging import BODIES, Dragging, Trials
+from dcc_jax.evaluate.dragging import BODIES, STEPS, Dragging, Trials
 from dcc_jax.play.pull import Pulled
 from dcc_jax.play.runs import Run, find_run, make_environment
 
@@ -61,11 +61,16 @@ class Drag:
         return bootstrap.share_of(near, self.episode[at], self._resamples())
 
     def stiffness(self, body: str) -> Interval:
-        """Median of the measured stiffness at a body, N/m."""
+        """Median of the measured stiffness at a body, N/m.
+
+        It is one over the median yield of a newton: a body that balance moves against
+        the force is stiffer than all others, not softer.
+        """
         at = self.at(body)
-        return bootstrap.quantile(
-            self.measured[at], self.episode[at], 0.5, self._resamples()
+        found = bootstrap.quantile(
+            1.0 / self.measured[at], self.episode[at], 0.5, self._resamples()
         )
+        return Interval(*(1.0 / x for x in (found.value, found.high, found.low)))
 
     def expected(self, body: str) -> float:
         """Median of the theoretical stiffness over the same trials, N/m."""
@@ -127,12 +132,17 @@ def prepare(
             f"a drag's theory is that of 'admittance', and the law is {law!r}"
         )
     low, high = run.alphas
-    levels = [x for x in LEVELS if low <= x <= high] if alpha is None else list(alpha)
+    known = [x for x in LEVELS if low <= x <= high] or sorted({low, high})
+    levels = known if alpha is None else list(alpha)
+    if not levels:
+        raise ValueError("alpha must hold a level of compliance")
     for level in levels:
         run.config.env.compliance.check_alpha(level)
     changes = {f"task.{name}": value for name, value in (task or {}).items()}
     changed = run.config.with_(changes)
     environment = make_environment(run, Pulled(changed.task.quiet()))
+    if environment.follows_reference:
+        _check_length(environment)
     return DragPlan(run, environment, levels, Trials.of(episodes), seed)
 
 
@@ -157,9 +167,20 @@ def slope(drags: Sequence[Drag], body: str) -> float:
     at = np.flatnonzero((drags[0].body == BODIES.index(body)) & upright)
     if len(drags) < 2 or not len(at):
         return np.nan
-    found = np.log([np.median(drag.measured[at]) for drag in drags])
+    found = -np.log([np.median(1.0 / drag.measured[at]) for drag in drags])
     expected = np.log([np.median(drag.theory[at]) for drag in drags])
     return float(np.polyfit(expected, found, 1)[0])
+
+
+def _check_length(environment: Environment) -> None:
+    references, steps = environment.references, STEPS / CONTROL_RATE
+    ends = ~references.loop & (references.duration < steps)
+    if bool(ends.any()):
+        name = references.names[int(ends.argmax())]
+        raise ValueError(
+            f"a drag lasts {steps:g} s, and the clip {name} that "
+            f"{environment.task.name} follows ends before"
+        )
 
 
 def _measured(plan: DragPlan, alpha: float, play: Dragging) -> Drag:

@@ -120,7 +120,7 @@ class Dragging:
             draws = jax.vmap(lambda key: jax.random.fold_in(key, time))(given.key)
             state = jax.vmap(_dragged)(state, given.force_w)
             state = jax.vmap(environment.step)(draws, state, action)
-            ended = ended | state.terminated
+            ended = ended | state.terminated | state.truncated
             return (state, ended), jax.vmap(scene.character_qpos)(state.body.qpos)
 
         start = jax.vmap(self._reset)(given)

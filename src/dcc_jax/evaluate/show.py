@@ -141,7 +141,8 @@ def _draw_ratios(axes: Axes, report: Report) -> None:
     low, high = axes.get_xlim()
     axes.set_xlim(min(low, 0.9), max(high, 1.1))
     axes.set_yticks(-np.arange(len(COMPARED)), COMPARED, fontsize=8)
-    baseline = _name(report, 0) if report.comparisons else "nothing to compare with"
+    baselines = {_name(report, c.baseline) for c in report.comparisons}
+    baseline = baselines.pop() if len(baselines) == 1 else "its baseline"
     axes.set_title(f"ratio of means to {baseline}")
 
 

@@ -42,8 +42,8 @@ class PpoConfig:
     """The probability ratio counts within 1 +- clip (Schulman 2017)."""
 
     learning_rate: float = 1e-5
-    """Step size of the policy (Sec. 5.1), the first one if `target_kl` is set: with a
-    larger one Adam's first steps would undo the warm start."""
+    """Step size of the policy (Sec. 5.1), the first one if `target_kl` is set: within
+    an update or two it is where the divergence takes it."""
 
     value_learning_rate: float = 3e-4
     """Step size of the value function; the paper has 1e-5 for both."""
@@ -115,8 +115,8 @@ def init_agent(
 ) -> Agent:
     """Draws both networks.
 
-    Departure: the policy's last layer is a hundredth of Xavier's, so that the first
-    policy leaves the pose offsets near zero instead of drawing them at random.
+    Departure: the last layers are a hundredth of Xavier's, so that the first policy
+    leaves the pose offsets near zero and the first values are, instead of random ones.
     """
     policy_key, value_key = jax.random.split(key)
     policy = networks.init_mlp(
@@ -126,7 +126,9 @@ def init_agent(
         activation=config.activation,
     )
     sizes = (observation_size, *config.hidden, 1)
-    value = networks.init_mlp(value_key, sizes, activation=config.activation)
+    value = networks.init_mlp(
+        value_key, sizes, output_gain=0.01, activation=config.activation
+    )
     of_policy, of_value = make_optimizers(config)
     return Agent(
         policy=networks.init_network(policy, of_policy),
@@ -205,6 +207,7 @@ def policy_loss(
     return -jnp.mean(gain), {
         "ppo/policy_loss": -jnp.mean(gain),
         # E[(r - 1) - log r]: unbiased, never negative (Schulman 2020).
+        # Before the step it belongs to: zero in the first of an update.
         "ppo/kl": jnp.mean(ratio - 1.0 - log_ratio),
         "ppo/clip_fraction": jnp.mean(outside.astype(jnp.float32)),
     }

@@ -49,8 +49,12 @@ class TrainConfig:
 
     start_from: str | None = None
     """A run directory or the name of a policy that ships, whose policy this training
-    begins with, in place of the warm start. The value function begins anew, and the
-    policy waits for it for 50 updates."""
+    begins with, in place of the warm start. The value function begins anew."""
+
+    policy_waits: int = 20
+    """Updates in which the value function learns alone, where the policy begins with a
+    warm start or another's: what it learned would be lost to a value function that
+    knows nothing yet (not the paper's)."""
 
     checkpoint_interval: int = 50
     """Updates between checkpoints; one is also written at the end and on a signal."""
@@ -75,14 +79,21 @@ class TrainConfig:
             value = getattr(self, name)
             if value < 1:
                 raise ValueError(f"train.{name} must be 1 or more, got {value}")
-        if self.warm_start_steps < 0:
-            raise ValueError(
-                f"train.warm_start_steps must be 0 or more, got {self.warm_start_steps}"
-            )
+        for name in ("warm_start_steps", "policy_waits"):
+            if getattr(self, name) < 0:
+                raise ValueError(
+                    f"train.{name} must be 0 or more, got {getattr(self, name)}"
+                )
         if self.chunk_size is not None and self.chunk_size < 1:
             raise ValueError(
                 f"train.chunk_size must be 1 or more, or None, got {self.chunk_size}"
             )
+
+    @property
+    def waits(self) -> int:
+        """Updates that the policy waits, none where it begins with random weights."""
+        begins_anew = self.start_from is None and not self.warm_start_steps
+        return 0 if begins_anew else self.policy_waits
 
     @property
     def tuples_per_update(self) -> int:

@@ -39,9 +39,6 @@ from dcc_jax.learn.state import (
 )
 
 Array = jax.Array
-VALUE_FIRST = 50
-"""Updates in which a policy that is not new waits for its value function."""
-
 # Environments whose working set stays in the cache of a core.
 _CPU_CHUNK = 128
 
@@ -84,8 +81,9 @@ def update_state(
     reward, of_reward = _rewards(state, taken.transitions, environment, config)
     batch = _ppo_batch(state, taken, reward, config.ppo)
     agent, of_ppo = ppo.update(ppo_key, state.agent, batch, config.ppo, AXIS)
-    if config.train.start_from is not None:
-        agent = _policy_waiting(state, agent)
+    waits = config.train.waits
+    if waits:
+        agent = _policy_waiting(state, agent, waits)
     averaged = _averaged(state, agent, config.train)
     metrics |= of_reward | of_ppo
     episodes = _episodes(taken.transitions)
@@ -108,21 +106,19 @@ def _averaged(state: TrainState, agent: ppo.Agent, config: TrainConfig) -> netwo
 
     Departure: the paper takes the last policy, as `train.averaged_updates = 1` does.
     """
-    waited = 0 if config.start_from is None else VALUE_FIRST
-    count = jnp.clip(state.update + 1 - waited, 1, config.averaged_updates)
+    count = jnp.clip(state.update + 1 - config.waits, 1, config.averaged_updates)
     now: Any = agent.policy.params  # Any: optax's types know no dataclass
     before: Any = state.averaged
     mean: Any = optax.incremental_update(now, before, 1.0 / count)
     return mean
 
 
-def _policy_waiting(state: TrainState, agent: ppo.Agent) -> ppo.Agent:
+def _policy_waiting(state: TrainState, agent: ppo.Agent, updates: int) -> ppo.Agent:
     """The new agent, whose policy stays what it was in the first updates.
 
-    The advantages of a value function that knows nothing yet would spoil it: without
-    this `chicken-fight` fell in half of its episodes after 3 M tuples, from none.
+    The advantages of a value function that knows nothing yet would spoil it.
     """
-    waits = state.update < VALUE_FIRST
+    waits = state.update < updates
     policy = jax.tree.map(
         lambda old, new: jnp.where(waits, old, new), state.agent.policy, agent.policy
     )

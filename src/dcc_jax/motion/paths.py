@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from dcc_jax import draws
-from dcc_jax.character import CONTROL_DT
+from dcc_jax.character import CONTROL_DT, CONTROL_RATE
 
 Array = jax.Array
 
@@ -126,7 +126,13 @@ def path(motion: Motion, time: Array) -> tuple[Array, Array, Array]:
 
 def end(motion: Motion) -> Array:
     """The end of the control step in s, when it is judged and observed."""
-    return motion.time + CONTROL_DT
+    return whole_steps(motion.time + CONTROL_DT)
+
+
+def whole_steps(time: Array) -> Array:
+    """The nearest whole number of control steps, s: sums of float32 drift from it, by
+    half a second in ten minutes."""
+    return jnp.round(time * CONTROL_RATE) / CONTROL_RATE
 
 
 def length(vector: Array) -> Array:

@@ -23,7 +23,7 @@ PANELS = {
     "discriminator: share judged right": ("disc/accuracy_real", "disc/accuracy_fake"),
     "distance to the clips (m)": ("style/nearest", "style/frechet", "style/floor"),
     "torque (RMS, N m)": ("env/torque_rms",),
-    "KL divergence of an update": ("ppo/kl",),
+    "KL divergence, mean over the steps of an update": ("ppo/kl",),
     "tuples per second": ("tuples_per_second",),
 }
 _POINTS = 200  # of a line, at most: equally many neighbouring updates are averaged

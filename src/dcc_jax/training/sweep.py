@@ -244,15 +244,17 @@ def _finish(
     stop: StopSignal,
     say: Callable[[str], None],
 ) -> SweepResult:
+    train = sweep.config.train
+    finished = done * train.tuples_per_update >= train.total_tuples
     result = SweepResult(
         rows=plan.rows(sweep.run_dirs),
         policies=_policies(sweep, jax.device_get(state)),
         run_dir=sweep.run_dir,
         run_dirs=sweep.run_dirs,
-        finished=not stop.name,
+        finished=finished,
     )
     result.to_csv(sweep.run_dir / "table.csv")
-    if stop.name:
+    if not finished:
         say(f"stopped by {stop.name} after update {done}; saved, resume continues it")
     else:
         say(f"finished after update {done}: {sweep.run_dir}")

@@ -22,7 +22,8 @@ def verdict(rows: Sequence[dict[str, float]]) -> str:
     Returns:
         A sentence; an empty one where the style was not measured yet.
     """
-    measured = [row for row in rows if row.get("style/floor")]
+    # Where every environment was just reset there is a floor and no distance.
+    measured = [row for row in rows if row.get("style/nearest") is not None]
     if not measured:
         return ""
     nearest = [row["style/nearest"] for row in measured]
