@@ -38,6 +38,7 @@ _CPU = {
 }
 
 _GPU = {
+    "ppo.discount": 0.98,
     "ppo.minibatch_size": 16384,
     "disc.minibatch_size": 2048,
     "train.num_envs": 4096,
