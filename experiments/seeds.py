@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from control_table import SKILLS, Line
@@ -19,7 +20,9 @@ from scipy import stats
 
 import dcc_jax
 from dcc_jax import runtime
-from dcc_jax.evaluate.report import Report
+
+if TYPE_CHECKING:
+    from dcc_jax.evaluate.report import Report
 
 
 def means(report: Report, line: Line) -> list[float]:

@@ -14,6 +14,10 @@ import argparse
 import numpy as np
 
 from dcc_jax import runtime
+
+if __name__ == "__main__":
+    runtime.ensure(devices=1)
+
 from dcc_jax.env.config import CONTROL_RATE
 from dcc_jax.play.program import Program
 from dcc_jax.play.runs import find_run
@@ -48,7 +52,6 @@ def main() -> None:
     add("--directions", type=int, default=12, help="episodes of each cell (12)")
     add("--seed", type=int, default=1)
     options = parser.parse_args()
-    runtime.ensure(devices=1)
     heads = [f"{newtons:g} N" for newtons in options.newtons]
     print(f"| falls of {options.directions} | alpha | {' | '.join(heads)} |")
     print("|---|--:|" + "--:|" * len(heads))
