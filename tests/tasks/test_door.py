@@ -12,7 +12,7 @@ from dcc_jax import physics
 from dcc_jax.character import Character, asset_path, compose_scene
 from dcc_jax.env.config import EnvConfig
 from dcc_jax.env.environment import Environment
-from dcc_jax.env.observation import PHASE_SIZE
+from dcc_jax.env.observation import ALPHA_ENTRY, PHASE_SIZE
 from dcc_jax.motion.clip import Clip, load_clip
 from dcc_jax.motion.reference import make_references
 from dcc_jax.tasks import door
@@ -276,7 +276,7 @@ def test_the_hand_takes_hold_near_the_knob_and_lets_go_on_time(played):
 
 
 def test_the_phase_goes_on_and_the_clip_is_followed(environment, played):
-    seen = np.asarray(played.obs)[:, :, -(TASK.state_size + PHASE_SIZE) :]
+    seen = np.asarray(played.obs)[:, :, ALPHA_ENTRY + 1 :]
     phase, cos, sin = np.moveaxis(seen[:, :, :PHASE_SIZE], -1, 0)
     np.testing.assert_allclose(cos + 1j * sin, np.exp(2j * np.pi * phase), atol=1e-5)
     np.testing.assert_allclose(np.diff(phase), 1 / 150, rtol=1e-3)

@@ -17,7 +17,7 @@ import numpy as np
 from dcc_jax import quat
 from dcc_jax.character import CONTROL_DT, load_character
 from dcc_jax.motion import paths
-from dcc_jax.motion.paths import Gaits, Motion, direction, path
+from dcc_jax.motion.paths import Gaits, Motion, direction, path, whole_steps
 from dcc_jax.motion.reference import References, RefState, planar_moved
 
 Array = jax.Array
@@ -169,7 +169,7 @@ def go_on(
         at: the reference before, its time likewise.
         elapsed: s.
     """
-    time = at.time + elapsed
+    time = whole_steps(at.time) + elapsed
     position, heading, speed = path(motion, time)
     velocity = speed * direction(heading)
 
