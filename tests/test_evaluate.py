@@ -310,6 +310,8 @@ def _damaged(push: Path, folder: Path) -> Path:
         (["{other}"], ["task must be one of", "'fly'"]),
         (["{smaller}"], ["20 observations", "push has"]),
         (["{push}", "--bogus"], ["--bogus"]),
+        (["{push}", "--drag", "--seconds", "3"], ["--seconds does nothing with --dr"]),
+        (["backflip", "--drag"], ["a drag lasts 7 s", "the clip backflip"]),
     ],
 )
 def test_bad_input_is_one_line_and_status_two(argv, parts, push, tmp_path, capsys):

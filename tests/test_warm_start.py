@@ -54,6 +54,8 @@ def test_optimiser_forgets_the_lesson():
 def test_negative_steps_are_refused():
     with pytest.raises(ValueError, match="warm_start_steps must be 0 or more, got -1"):
         TrainConfig(warm_start_steps=-1)
+    with pytest.raises(ValueError, match=r"policy_waits must be less than 2\^31"):
+        TrainConfig(policy_waits=10**12)
 
 
 @pytest.fixture(scope="module", params=["trampoline", "door"])

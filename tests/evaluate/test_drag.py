@@ -203,6 +203,8 @@ def test_who_fell_does_not_count():
     found.fell[found.body == 0] = True
     assert np.isnan(found.stiffness(BODIES[0]).value)
     assert np.isnan(found.share_near(BODIES[0]).value)
+    cells = [list(c.cells) for c in show_drag.table("run", [found]).columns]
+    assert [column[0] for column in cells[3:6]] == ["-", "-", "-"]
     assert found.share_near(BODIES[1]).value > 0.9
 
 

@@ -117,8 +117,10 @@ def _plan_drag(options: Options) -> command.Work:
 
     if len(options.run_dir) != 1:
         raise ValueError(f"--drag takes one RUN_DIR, got {len(options.run_dir)}")
-    if options.seconds is not None or not options.control:
-        raise ValueError("--seconds and --no-control do nothing with --drag")
+    if options.seconds is not None:
+        raise ValueError("--seconds does nothing with --drag")
+    if not options.control:
+        raise ValueError("--no-control does nothing with --drag")
     run = find_run(options.run_dir[0])
     plan = drag.prepare(
         run,

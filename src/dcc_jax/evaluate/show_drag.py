@@ -12,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from rich.table import Table
 
+from dcc_jax.evaluate.bootstrap import Interval
 from dcc_jax.evaluate.drag import NEAR, SEEN, Drag, slope
 from dcc_jax.evaluate.dragging import BODIES
 
@@ -40,15 +41,21 @@ def table(name: str, drags: Sequence[Drag]) -> Table:
                 body,
                 f"{drag.alpha:g}",
                 f"{drag.expected(body):.0f}",
-                f"{found.value:.0f} [{found.low:.0f}, {found.high:.0f}]",
-                f"{near.value:.0%} [{near.low:.0%}, {near.high:.0%}]",
-                f"{seen.value:.0%} [{seen.low:.0%}, {seen.high:.0%}]",
+                _interval(found, ".0f"),
+                _interval(near, ".0%"),
+                _interval(seen, ".0%"),
                 f"{fell:.0%}",
             )
         if len(drags) > 1:
             page.add_row(body, "", "", f"log-log slope {slope(drags, body):.2f}")
         page.add_section()
     return page
+
+
+def _interval(of: Interval, form: str) -> str:
+    if np.isnan(of.value):  # no trial ended upright
+        return "-"
+    return f"{of.value:{form}} [{of.low:{form}}, {of.high:{form}}]"
 
 
 def to_json(name: str, drags: Sequence[Drag]) -> str:

@@ -80,10 +80,13 @@ class TrainConfig:
             if value < 1:
                 raise ValueError(f"train.{name} must be 1 or more, got {value}")
         for name in ("warm_start_steps", "policy_waits"):
-            if getattr(self, name) < 0:
-                raise ValueError(
-                    f"train.{name} must be 0 or more, got {getattr(self, name)}"
-                )
+            value = getattr(self, name)
+            if value < 0:
+                raise ValueError(f"train.{name} must be 0 or more, got {value}")
+        for name in ("policy_waits", "averaged_updates"):
+            value = getattr(self, name)
+            if value >= 2**31:  # as an int32 the device counts updates
+                raise ValueError(f"train.{name} must be less than 2^31, got {value}")
         if self.chunk_size is not None and self.chunk_size < 1:
             raise ValueError(
                 f"train.chunk_size must be 1 or more, or None, got {self.chunk_size}"

@@ -56,7 +56,7 @@ def check(run_dir: Path, wanted: Config, resume: bool) -> None:
             )
     elif run_dir.exists() and (not run_dir.is_dir() or any(run_dir.iterdir())):
         raise ValueError(
-            f"run_dir {run_dir} exists and is not empty; resume continues a run"
+            f"run_dir {run_dir} exists and is not empty; --resume continues a run"
         )
 
 

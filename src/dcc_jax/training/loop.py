@@ -249,10 +249,9 @@ def _finish(
     say: Callable[[str], None],
 ) -> TrainResult:
     if not finished:
-        say(
-            f"stopped by {stop.name or 'another process'} after update {done}; saved, "
-            f"continue with --resume --run-dir {run.run_dir}"
-        )
+        by = stop.name or "another process"
+        when = f"after update {done}; saved" if done else "before the first update"
+        say(f"stopped by {by} {when}, continue with --resume --run-dir {run.run_dir}")
     else:
         say(f"finished after update {done}; watch it: dcc-jax view {run.run_dir}")
     metrics = logs.read(run.run_dir)
