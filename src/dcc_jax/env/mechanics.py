@@ -120,7 +120,8 @@ def sliding(mechanics: Mechanics, q: Array, q_previous: Array) -> Array:
     """How fast what stands of each foot slides over the ground, [2] m/s.
 
     The mean over the spheres of a foot, of which each counts by how near to the ground
-    it is at both moments: all of it on the ground and below, 14 % `TOUCH` above.
+    it is at both moments: all of it on the ground and below, 14 % `TOUCH` above. What
+    the discriminator sees has to be smooth; `slip` is the measure of an evaluation.
 
     Args:
         mechanics: of the character.

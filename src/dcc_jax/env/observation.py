@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from dcc_jax import physics, quat
 from dcc_jax.character import Character
-from dcc_jax.env import features
+from dcc_jax.env import expert, features
 from dcc_jax.env.features import STATE_SIZE, Kinematics
 from dcc_jax.env.state import EnvState
 from dcc_jax.env.task import RootTarget, Task
@@ -103,10 +103,9 @@ def of_pose(
     coords = kinematics.coords
     _, here = coords.split_q(q)
     _, there = coords.split_q(reference)
-    _, middle = coords.split_q(nominal)
     turn = quat.log(quat.mul(quat.inv(here[:1]), there[:1]))
-    joints = quat.log(quat.mul(quat.inv(middle[1:]), there[1:]))
-    return jnp.concatenate([reference[2:3], turn.ravel(), joints.ravel()])
+    joints = expert.action(kinematics, nominal, reference)
+    return jnp.concatenate([reference[2:3], turn.ravel(), joints])
 
 
 def _seen_from(q: Array, vector: Array) -> Array:
