@@ -14,7 +14,7 @@ HOME ?= $(CURDIR)/$(VENV)
 export HOME
 # `make run`: about three minutes of learning on two cores.
 RUN := runs/door-$(shell date +%Y%m%d-%H%M%S)
-LEARN := --task door --env.alpha 0 --env.alpha-max 0.8 --train.total-tuples 1638400
+LEARN := --task door --env.alpha 0 --env.alpha-max 0.8 --run-dir $(RUN)
 
 # Tests that share a compiled program run on one worker (tests/conftest.py).
 WORKERS := -n auto --dist loadgroup --no-loadscope-reorder
@@ -37,10 +37,10 @@ view: setup
 	$(BIN)/python -m dcc_jax.view $(POLICY)
 
 run: setup
-	$(BIN)/python -m dcc_jax.train $(LEARN) --run-dir $(RUN)
+	$(BIN)/python -m dcc_jax.train $(LEARN) --train.total-tuples 1638400
 	$(BIN)/python -m dcc_jax.render $(RUN) --seconds 5 --out $(RUN)/policy.mp4
 	@echo "curves: $(RUN)/curves.png   video: $(RUN)/policy.mp4   go on: \
-	$(BIN)/python -m dcc_jax.train $(LEARN) --train.total-tuples 4000000 --resume --run-dir $(RUN)"
+	$(BIN)/python -m dcc_jax.train $(LEARN) --train.total-tuples 4000000 --resume"
 	@echo "pull what was learned, in a browser:   make view POLICY=$(RUN)"
 
 test: setup
