@@ -214,12 +214,24 @@ def test_hop_uses_one_leg_and_goes_everywhere(motions):
     assert (eighth[1:] == eighth[:-1]).sum() > 10  # several in a row
 
 
-def test_hop_in_place_lands_where_it_left(motions):
-    motion = motions["hop_in_place"]
-    flights = [motion.state.com[part, :2] for part in motion.flights()]
-    assert len(flights) > 20
+@pytest.mark.parametrize(
+    ("name", "way"),
+    [
+        ("hop_cycle", (0.0, 0.0)),
+        ("hop_ahead_cycle", (0.2, 0.0)),
+        ("hop_left_cycle", (0.0, 0.2)),
+    ],
+)
+def test_cycles_of_hops_land_where_they_should(motions, name, way):
+    motion = motions[name]
+    whole = [path for path in motion.flights() if path.start > 0]
+    flights = [motion.state.com[part, :2] for part in whole]
+    assert len(flights) >= 4
     for path in flights:
-        np.testing.assert_allclose(path[-1], path[0], atol=0.01)
+        share = 0.2 / 0.48  # of a hop, in the air
+        np.testing.assert_allclose(
+            path[-1] - path[0], np.multiply(way, share), atol=0.03
+        )
 
 
 def test_hand_stays_on_the_knob_of_a_closed_to_open_door(motions):

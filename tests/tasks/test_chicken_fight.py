@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 
 import chex
 import jax
@@ -14,7 +15,7 @@ import pytest
 from dcc_jax import config, physics
 from dcc_jax.character import CONTROL_DT, asset_path, compose_scene, load_character
 from dcc_jax.motion.clip import load_clip
-from dcc_jax.motion.reference import make_references
+from dcc_jax.motion.reference import References, make_references
 from dcc_jax.tasks import chicken_fight
 from dcc_jax.tasks.chicken_fight import HALF_SIZE, LONG, ChickenFight
 from dcc_jax.training import loop
@@ -36,7 +37,7 @@ def scene() -> physics.Scene:
 
 @pytest.fixture(scope="module")
 def reference():
-    references = make_references([load_clip(asset_path("motions/hop_in_place.npz"))])
+    references = hops()
     return references.state_at(0, 3.0)
 
 
@@ -87,6 +88,12 @@ def bumps(scene, began):
 
     compiled = jax.jit(jax.vmap(chex.assert_max_traces(n=1)(run)))
     return jax.tree.map(np.array, compiled(jnp.asarray(SIDES, jnp.float32)))
+
+
+def hops(names=TASK.clips) -> References:
+    return make_references(
+        [load_clip(asset_path(f"motions/{name}.npz")) for name in names]
+    )
 
 
 def box(scene: physics.Scene) -> tuple[int, int]:
@@ -241,18 +248,68 @@ def test_the_opponent_is_seen_from_the_character(scene, began):
     np.testing.assert_allclose(state, [0.7, 0.0, -0.5, -0.3], atol=1e-5)
 
 
-def test_the_reference_hops_slowly_where_it_likes(scene, reference):
-    keys = jax.random.split(jax.random.key(5), 30)
+def test_hops_travel_as_fast_as_their_path_to_every_side(scene):
+    """A sole that stands keeps its place on the ground, whichever way they go."""
+    references = hops()
+    model = compose_scene(load_character(), floor=False)
+    data = mujoco.MjData(model)
+    times = np.arange(0.0, float(references.duration[0]), 1.0 / 120.0)
+    pose = jax.jit(
+        jax.vmap(partial(chicken_fight.hopping, references), in_axes=(0, None))
+    )
+    heel = [f"left_sole_{side}" for side in ("heel_in", "heel_out")]
+    soles = [model.geom(name).id for name in heel]
 
-    def wander(key):
-        state, _, _ = TASK.reset(key, scene, reference)
-        return chicken_fight.paths.path(state.motion, jnp.zeros(()))
+    def slide(velocity: np.ndarray) -> float:
+        """How fast the heel moves while it is lowest, m/s."""
+        qpos = np.array(pose(jnp.asarray(times), jnp.asarray(velocity)))
+        qpos[:, :2] += times[:, None] * velocity
+        spots = []
+        for q in qpos:
+            data.qpos[:] = q
+            mujoco.mj_kinematics(model, data)
+            spots.append(data.geom_xpos[soles].mean(axis=0))
+        spots = np.array(spots)
+        speed = np.linalg.norm(np.gradient(spots[:, :2], times[1], axis=0), axis=1)
+        return float(np.median(speed[spots[:, 2] < np.quantile(spots[:, 2], 0.2)]))
 
-    position, heading, speed = jax.jit(jax.vmap(wander))(keys)
-    np.testing.assert_allclose(position, np.tile(reference.qpos[:2], (30, 1)))
-    assert np.ptp(np.array(heading)) > 4.0
-    np.testing.assert_allclose(speed, 0.0)
-    assert max(TASK.gaits.speeds) <= 0.1
+    on_the_spot = slide(np.zeros(2))
+    for side in SIDES:
+        there = 0.4 * np.array([np.cos(side), np.sin(side)])
+        assert slide(there) < on_the_spot + 0.03
+
+
+def test_the_reference_goes_where_its_path_goes(scene):
+    references = hops()
+    first = jax.jit(
+        lambda key, begin: TASK.first_reference(key, references, begin),
+        static_argnums=1,
+    )
+    for key in jax.random.split(jax.random.key(5), 8):
+        at = first(key, False)
+        covered = (at.qpos - at.qpos_previous)[:2] / CONTROL_DT
+        np.testing.assert_allclose(covered, at.travel, atol=1e-4)
+        np.testing.assert_allclose(at.qvel[:2], at.travel, atol=1e-4)
+        speed = float(jnp.linalg.norm(at.travel))
+        assert np.abs(np.subtract(TASK.gaits.speeds, speed)).min() < 1e-5
+        state, _, _ = TASK.reset(key, scene, at)
+        state, _ = TASK.control_step(
+            key,
+            scene,
+            state,
+            physics.initial_state(scene, *TASK.reset(key, scene, at)[1:]),
+        )
+        after = TASK.reference(references, state, at, CONTROL_DT)
+        np.testing.assert_allclose(
+            (after.qpos - at.qpos)[:2] / CONTROL_DT, at.travel, atol=0.06
+        )
+    standing = first(jax.random.key(5), True)
+    assert not standing.travel.any() and standing.time == 0.0
+
+
+def test_clips_that_are_no_three_hops_are_refused():
+    with pytest.raises(ValueError, match="three loops"):
+        chicken_fight.hopping(hops(("walk_cycle",)), jnp.zeros(()), jnp.zeros(2))
 
 
 def test_a_character_moves_alike_at_any_mass():

@@ -113,7 +113,7 @@ def test_no_two_matches_begin_alike(match):
     ]
     assert len(set(moments)) == 4
     duration = float(side.references.duration[0])
-    assert min(moments) >= 0.0 and max(moments) <= 0.3 * duration
+    assert min(moments) >= 0.0 and max(moments) <= duration
 
 
 def test_impulses_are_opposite_and_are_what_each_gains(match, aloft):

@@ -79,7 +79,11 @@ RECIPES: dict[str, Recipe] = {
     **_turning("run", run.run, 0.15),
     "run_cycle": Recipe(run.run_cycle, "run", loop=True),
     "hop": Recipe(hop.hop, "hop"),
-    "hop_in_place": Recipe(partial(hop.hop, length=0.0), "hop"),
+    "hop_cycle": Recipe(partial(hop.hop_cycle, 0.0, 0.0), "hop", loop=True),
+    "hop_ahead_cycle": Recipe(
+        partial(hop.hop_cycle, hop.LENGTH, 0.0), "hop", loop=True
+    ),
+    "hop_left_cycle": Recipe(partial(hop.hop_cycle, 0.0, hop.LENGTH), "hop", loop=True),
     "door": Recipe(door.open_door, "door", phase=True),
 }
 """Every clip of ours; the recovery directions are degrees, 0 ahead, 90 left."""

@@ -146,7 +146,7 @@ def begin(
     before = loops.pose(references, earlier, speed, zero - dt).at[0].set(-dt * speed)
     return RefState(
         qpos=now,
-        qvel=_rate(references.coords, before, now, dt),
+        qvel=rate(references.coords, before, now, dt),
         qpos_previous=before,
         clip=jnp.zeros((), jnp.int32),
         time=zero,
@@ -180,11 +180,11 @@ def go_on(
         pose = loops.pose(references, phase(later), speed, time + later)
         return planar_moved(pose, heading + later * motion.turn, position)
 
-    rate = _rate(references.coords, at.qpos, pose(elapsed), 2.0 * elapsed)
+    velocities = rate(references.coords, at.qpos, pose(elapsed), 2.0 * elapsed)
     return dataclasses.replace(
         at,
         qpos=pose(0.0),
-        qvel=rate.at[:2].set(velocity),
+        qvel=velocities.at[:2].set(velocity),
         qpos_previous=at.qpos,
         time=time,
         travel=velocity,
@@ -192,7 +192,7 @@ def go_on(
     )
 
 
-def _rate(coords: quat.Coordinates, before: Array, now: Array, dt: float) -> Array:
+def rate(coords: quat.Coordinates, before: Array, now: Array, dt: float) -> Array:
     """The velocity [42] that leads from one pose to another within dt s."""
     scalars, quats = coords.split_q(before)
     later_scalars, later_quats = coords.split_q(now)

@@ -2,9 +2,10 @@
 
 In training the opponent is a box as heavy as the character that stands upright, slides
 over the ground and runs into the character from any side. After a bump it lets go, and
-comes again from elsewhere. The clip of hops is followed in time, its root slowly along
-a path of its own. The contact forces with the opponent, one resultant a body, feed the
-compliance. `tasks.match` lets two characters fight each other.
+comes again from elsewhere. Hops are followed in time, their root along a path: a loop
+of hops on the spot, and what two loops, ahead and to the left, have beside it, in
+proportion to the path's velocity. The contact forces with the opponent, one resultant a
+body, feed the compliance. `tasks.match` lets two characters fight each other.
 
 Departure: the paper trains with the discriminator. Hops have little in common with what
 a falling body does, and 0.66 M tuples took episodes from 0.8 to 1.3 s only; the clip's
@@ -29,7 +30,7 @@ from dcc_jax import draws, physics, quat
 from dcc_jax.character import CONTROL_DT, add_contact
 from dcc_jax.env import features
 from dcc_jax.env.task import Event, Forces, Task, place_character, resultant
-from dcc_jax.motion import paths
+from dcc_jax.motion import paths, planner
 from dcc_jax.motion.paths import Gaits, Motion
 from dcc_jax.motion.reference import References, RefState, planar_moved
 
@@ -70,7 +71,11 @@ class ChickenFight(Task):
     """Hop, and take a bump without falling."""
 
     name: ClassVar[str] = "chicken-fight"
-    clips: ClassVar[tuple[str, ...]] = ("hop_in_place",)
+    clips: ClassVar[tuple[str, ...]] = (
+        "hop_cycle",
+        "hop_ahead_cycle",
+        "hop_left_cycle",
+    )
     follows_reference: ClassVar[bool] = True
     state_size: ClassVar[int] = 4
     event: ClassVar[Event | None] = Event("send the box", "next_attack")
@@ -87,8 +92,8 @@ class ChickenFight(Task):
     """Prefix of the character's names in the scene."""
     opponent: str = "box"
     """The opponent's root joint, or the first of a box's; it starts with x and y."""
-    gaits: Gaits = field(default_factory=lambda: Gaits(speeds=(0.0, 0.05, 0.1)))
-    """How the reference's root moves: up to 5 cm a hop, with legs that hop in place."""
+    gaits: Gaits = field(default_factory=lambda: Gaits(speeds=(0.0, 0.2, 0.4)))
+    """How the reference's root moves, up to 19 cm a hop, to any side."""
     interval: float = 3.0
     """Time between two attacks, s."""
     speed: tuple[float, float] = (0.2, 0.6)
@@ -126,6 +131,19 @@ class ChickenFight(Task):
         for target in TARGETS:
             add_contact(spec, "box", target, FRICTION)
 
+    def first_reference(
+        self, key: Array, references: References, begin: bool
+    ) -> RefState:
+        """Any moment of hops at one of the speeds, to any side, or of hops on the
+        spot."""
+        time_key, speed_key, way_key = jax.random.split(key, 3)
+        share, way = jax.random.uniform(time_key), jax.random.uniform(way_key)
+        speed = jax.random.choice(speed_key, jnp.array(self.gaits.speeds))
+        if begin:
+            share, speed = 0.0 * share, 0.0 * speed
+        travel = speed * paths.direction(2.0 * jnp.pi * way)
+        return hopping_at(references, share * references.duration[0], travel)
+
     def reference(
         self,
         references: References,
@@ -133,14 +151,15 @@ class ChickenFight(Task):
         at: RefState,
         elapsed: float,
     ) -> RefState:
-        """The clip goes on, its root on its path."""
+        """The hops go on, their root on its path."""
         later = super().reference(references, state, at, elapsed)
         motion = state.motion
         position, heading, speed = paths.path(motion, motion.time + elapsed)
-        turned = planar_moved(later.qpos, state.facing, jnp.zeros(2))
+        travel = speed * paths.direction(heading - state.facing)
+        pose = hopping(references, later.time, travel)
         return dataclasses.replace(
             later,
-            qpos=turned.at[:2].set(position),
+            qpos=planar_moved(pose, state.facing, position),
             qvel=later.qvel.at[:2].set(speed * paths.direction(heading)),
         )
 
@@ -152,7 +171,7 @@ class ChickenFight(Task):
         way, wait = draws.uniform(draw_key, (-jnp.pi, jnp.pi), (0.0, self.interval))
         root = reference.qpos[:2]
         state = ChickenFightState(
-            motion=paths.begin(motion_key, self.gaits, root, jnp.zeros(2), way),
+            motion=paths.begin(motion_key, self.gaits, root, reference.travel, way),
             facing=jnp.zeros(()),
             next_attack=wait,
             coming=jnp.zeros((), bool),
@@ -280,6 +299,65 @@ class ChickenFight(Task):
             "opponent_distance": _length(q[:2] - body.qpos[adr : adr + 2]),
             "since_bump": state.since_bump,
         }
+
+
+def hopping(references: References, time: Array, velocity: Array) -> Array:
+    """The pose [55] at a moment of hops that travel, over the origin, facing x.
+
+    Joints and height are those on the spot, and the differences of the loops ahead and
+    to the left beside them, as rotation vectors, times the velocity's share of theirs.
+    Backwards and to the right they are taken the other way round.
+
+    Args:
+        references: three loops in step: on the spot, ahead and to the left.
+        time: of all three, s.
+        velocity: over the ground [2], m/s.
+    """
+    split = references.coords.split_q
+    spot, *others = (split(references.qpos_at(clip, time)) for clip in range(3))
+    height, turn = spot[0], jnp.zeros_like(spot[1][:, 1:])
+    for share, loop in zip(velocity / _speeds(references), others, strict=True):
+        height = height + share * (loop[0] - spot[0])
+        turn = turn + share * quat.log(quat.mul(quat.inv(spot[1]), loop[1]))
+    pose = references.coords.join_q(height, quat.mul(spot[1], quat.exp(turn)))
+    return pose.at[:2].set(0.0)
+
+
+def hopping_at(references: References, time: Array, velocity: Array) -> RefState:
+    """The reference at a moment of such hops, over the origin."""
+    now = hopping(references, time, velocity)
+    before = hopping(references, time - CONTROL_DT, velocity)
+    before = before.at[:2].set(-CONTROL_DT * velocity)
+    return dataclasses.replace(
+        references.state_at(0, time),
+        qpos=now,
+        qvel=planner.rate(references.coords, before, now, CONTROL_DT),
+        qpos_previous=before,
+        travel=velocity,
+    )
+
+
+@jax.ensure_compile_time_eval()
+def _speeds(references: References) -> np.ndarray:
+    """Of the loop ahead and of that to the left, m/s [2].
+
+    Raises:
+        ValueError: the clips are not the three loops that the task needs.
+    """
+    duration, shift = np.asarray(references.duration), np.asarray(references.shift)
+    if not (
+        len(duration) == 3
+        and np.asarray(references.loop).all()
+        and np.ptp(duration) < 1e-3
+        and np.linalg.norm(shift[0]) < 0.02
+        and min(shift[1, 0], shift[2, 1]) > 0.1
+    ):
+        raise ValueError(
+            "env.clips must be three loops of one duration for task 'chicken-fight', "
+            "hops on the spot, ahead and to the left, got "
+            + ", ".join(references.names)
+        )
+    return np.array([shift[1, 0], shift[2, 1]]) / duration[0]
 
 
 def opponent_contacts(

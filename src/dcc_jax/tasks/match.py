@@ -34,6 +34,7 @@ from dcc_jax.tasks.chicken_fight import (
     TARGETS,
     ChickenFight,
     ChickenFightState,
+    hopping_at,
 )
 
 Array = jax.Array
@@ -42,7 +43,6 @@ RIVAL = "rival_"
 """Prefix of the second character's names."""
 ROOT = "root"
 REACH = 0.15  # m; the reference's root is so far ahead, towards the opponent
-EARLY = 0.3  # of its clip, in which a match begins
 BUMP_TIME = 1.0  # s after its beginning a bump is over
 Sides = tuple[EnvState, EnvState]
 
@@ -54,9 +54,9 @@ class Fighter(ChickenFight):
     def first_reference(
         self, key: Array, references: References, begin: bool
     ) -> RefState:
-        """Early in the clip, so that it lasts, and never twice the same."""
-        at = super().first_reference(key, references, begin=False)
-        return references.state_at(at.clip, EARLY * at.time)
+        """Hops ahead, where the opponent is, and never twice the same."""
+        time = jax.random.uniform(key, maxval=references.duration[0])
+        return hopping_at(references, time, jnp.array([max(self.gaits.speeds), 0.0]))
 
     def aimed(
         self, scene: physics.Scene, state: ChickenFightState, body: physics.State
