@@ -286,19 +286,17 @@ def test_the_reference_goes_where_its_path_goes(scene):
         static_argnums=1,
     )
     for key in jax.random.split(jax.random.key(5), 8):
-        at = first(key, False)
+        first_key, key = jax.random.split(key)
+        at = first(first_key, False)
         covered = (at.qpos - at.qpos_previous)[:2] / CONTROL_DT
         np.testing.assert_allclose(covered, at.travel, atol=1e-4)
         np.testing.assert_allclose(at.qvel[:2], at.travel, atol=1e-4)
         speed = float(jnp.linalg.norm(at.travel))
         assert np.abs(np.subtract(TASK.gaits.speeds, speed)).min() < 1e-5
-        state, _, _ = TASK.reset(key, scene, at)
-        state, _ = TASK.control_step(
-            key,
-            scene,
-            state,
-            physics.initial_state(scene, *TASK.reset(key, scene, at)[1:]),
-        )
+        reset_key, step_key = jax.random.split(key)
+        state, qpos, qvel = TASK.reset(reset_key, scene, at)
+        body = physics.initial_state(scene, qpos, qvel)
+        state, _ = TASK.control_step(step_key, scene, state, body)
         after = TASK.reference(references, state, at, CONTROL_DT)
         np.testing.assert_allclose(
             (after.qpos - at.qpos)[:2] / CONTROL_DT, at.travel, atol=0.06
