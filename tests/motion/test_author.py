@@ -137,7 +137,10 @@ def test_muscles_and_soles_could_have_made_the_motion(motions, name):
     assert np.median(needs.moment) < 4.0
 
 
-@pytest.mark.parametrize("name", [n for n in ALL if n.endswith("_cycle")])
+STRIDES = [n for n in ALL if n.endswith("_cycle") and not n.startswith("hop")]
+
+
+@pytest.mark.parametrize("name", STRIDES)
 def test_legs_stretch_in_every_step(motions, name):
     """Nobody walks or runs in a crouch."""
     motion = motions[name]

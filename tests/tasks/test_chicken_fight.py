@@ -12,13 +12,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from dcc_jax import config, physics
+from dcc_jax import config, physics, tasks
 from dcc_jax.character import CONTROL_DT, asset_path, compose_scene, load_character
 from dcc_jax.motion.clip import load_clip
 from dcc_jax.motion.reference import References, make_references
 from dcc_jax.tasks import chicken_fight
 from dcc_jax.tasks.chicken_fight import HALF_SIZE, LONG, ChickenFight
-from dcc_jax.training import loop
 
 TASK = ChickenFight()
 MASS = 36.0  # kg, the light player
@@ -316,7 +315,8 @@ def test_a_character_moves_alike_at_any_mass():
     def played(mass: float):
         made = config.make_config("chicken-fight")
         env = dataclasses.replace(made.env, mass=mass, alpha=0.16)
-        environment = loop.make_environment(dataclasses.replace(made, env=env))
+        fast = dataclasses.replace(made.task, speed=(0.9, 1.0))
+        environment = tasks.make_environment(fast, env)
 
         def step(state, at):
             key, action = at

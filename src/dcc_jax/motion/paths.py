@@ -57,7 +57,12 @@ class Gaits:
 
 
 def begin(
-    key: Array, gaits: Gaits, position: Array, velocity: Array, facing: Array
+    key: Array,
+    gaits: Gaits,
+    position: Array,
+    velocity: Array,
+    facing: Array,
+    sway: float = SWAY,
 ) -> Motion:
     """A partner that goes on for a while as the reference does at the reset.
 
@@ -65,11 +70,12 @@ def begin(
         key: consumed.
         gaits: what it may do later.
         position: of the reference's root [2], m, world.
-        velocity: of it [2], m/s. Below `SWAY` it stands, and will go where it faces.
+        velocity: of it [2], m/s. Below `sway` it stands, and will go where it faces.
         facing: heading of the reference, rad.
+        sway: m/s.
     """
     speed = length(velocity)
-    goes = speed > SWAY
+    goes = speed > sway
     heading = jnp.where(goes, jnp.arctan2(velocity[1], velocity[0]), facing)
     speed = jnp.where(goes, speed, 0.0)
     zero = jnp.zeros(())

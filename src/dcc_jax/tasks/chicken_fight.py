@@ -169,9 +169,10 @@ class ChickenFight(Task):
         """The box waits out of reach; it comes after a random share of the interval."""
         draw_key, motion_key = jax.random.split(key)
         way, wait = draws.uniform(draw_key, (-jnp.pi, jnp.pi), (0.0, self.interval))
-        root = reference.qpos[:2]
+        root, travel = reference.qpos[:2], reference.travel
+        motion = paths.begin(motion_key, self.gaits, root, travel, way, sway=0.1)
         state = ChickenFightState(
-            motion=paths.begin(motion_key, self.gaits, root, reference.travel, way),
+            motion=motion,
             facing=jnp.zeros(()),
             next_attack=wait,
             coming=jnp.zeros((), bool),
