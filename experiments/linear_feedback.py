@@ -163,7 +163,14 @@ def pushes(environment: Environment, speed: float) -> np.ndarray:
     """Velocities [N, nv]: the ball's, or the root's, in N directions."""
     way = np.random.default_rng(0).uniform(-np.pi, np.pi, TRIALS)
     first = np.zeros((TRIALS, environment.scene.model.nv))
-    if isinstance(environment.task, Ball):
+    if isinstance(environment.task, Ball) and environment.task.rolls:
+        dof = int(environment.scene.model.joint("ball").dofadr[0])
+        first[:, dof : dof + 2] = speed * np.stack([np.cos(way), np.sin(way)], axis=1)
+        spin = speed / environment.task.ball_radius
+        first[:, dof + 3 : dof + 5] = spin * np.stack(
+            [-np.sin(way), np.cos(way)], axis=1
+        )
+    elif isinstance(environment.task, Ball):
         dof = int(environment.scene.model.joint("pole").dofadr[0]) + 3
         rate = speed / environment.task.pole_length
         first[:, dof : dof + 2] = rate * np.stack([-np.sin(way), np.cos(way)], axis=1)
@@ -180,12 +187,13 @@ def main() -> None:
     parser.add_argument("--time", type=float, default=0.5, help="s into the clip")
     parser.add_argument("--speed", type=float, nargs="+", default=[0.05, 0.1, 0.2])
     parser.add_argument("--noise", type=float, nargs="+", default=[0.0], help="degrees")
+    parser.add_argument("--rolls", action="store_true", help="ball: free on a plate")
     options = parser.parse_args()
     wanted = config.make_config(options.task)
     env = dataclasses.replace(wanted.env, alpha=0.0)
     task = wanted.task
     if isinstance(task, Ball):
-        task = dataclasses.replace(task, tilt=0.0)
+        task = dataclasses.replace(task, tilt=0.0, rolls=options.rolls)
     environment = tasks.make_environment(task, env)
     system = System(environment, options.time)
     held = system.equilibrium()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -281,8 +283,128 @@ def test_fictional_forces_displace_head_and_root(environment, played):
     assert not np.asarray(played.terminated).any()
 
 
+# The ball that rolls.
+
+
+ROLLS = Ball(rolls=True, tilt=0.0)
+
+
+@pytest.fixture(scope="module")
+def rolling(character: Character) -> Environment:
+    references = make_references([load_clip(asset_path("motions/stand.npz"))])
+    return Environment(ROLLS, character, references, EnvConfig())
+
+
+def test_a_ball_rolls_down_its_plate_at_five_sevenths_of_the_slope(
+    character: Character,
+):
+    """A full sphere that does not slide, on a plate that nothing moves."""
+    lean = 0.1
+    model = compose_scene(character, floor=False, extend=ROLLS.extend)
+    model.dof_armature[: character.nv] = 1e6
+    pole, sphere = (int(model.joint(name).dofadr[0]) for name in ("pole", "ball"))
+    model.dof_armature[pole : pole + 6] = 1e6
+    scene = physics.make_scene(model, character)
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    crown = data.body("head").xpos + np.asarray(ball.CROWN)
+    turn = np.array([np.cos(lean / 2), 0.0, np.sin(lean / 2), 0.0])
+    up = np.array([np.sin(lean), 0.0, np.cos(lean)])
+    qpos = np.array(model.qpos0)
+    for name, place in (("pole", crown), ("ball", crown + ROLLS.pole_length * up)):
+        adr = int(model.joint(name).qposadr[0])
+        qpos[adr : adr + 7] = np.append(place, turn)
+
+    def step(body: physics.State, _):
+        kin = physics.kinematics(scene, body)
+        solution = physics.solve(scene, kin, body, jnp.zeros(model.nv))
+        body = physics.integrate(scene, body, solution)
+        return body, body.qvel[sphere : sphere + 6]
+
+    def roll(qpos):
+        body = physics.initial_state(scene, qpos, jnp.zeros(model.nv))
+        return jax.lax.scan(step, body, None, length=72)[1]
+
+    speed = np.asarray(jax.jit(roll)(jnp.asarray(qpos, jnp.float32)), float)
+    down = np.array([np.cos(lean), 0.0, -np.sin(lean)])
+    along = speed[24:, :3] @ down  # when it has settled into the soft contact
+    slope = np.diff(along) / scene.timestep
+    np.testing.assert_allclose(slope, 5.0 / 7.0 * GRAVITY * np.sin(lean), rtol=0.01)
+    turning = np.linalg.norm(speed[24:, 3:], axis=1) * ROLLS.ball_radius
+    np.testing.assert_allclose(turning, along, rtol=0.01)
+
+
+def test_a_push_makes_the_ball_roll_and_leaves_the_pole(rolling):
+    scene = rolling.scene
+    reference = rolling.references.state_at(0, 1.0)
+    _, qpos, qvel = ROLLS.reset(jax.random.key(0), scene, reference)
+    adr, dof = scene.address("ball")
+    qpos = qpos.at[adr + 3 : adr + 7].set(quat.exp(jnp.array([0.4, 1.0, -0.3])))
+    body = physics.initial_state(scene, qpos, qvel)
+    due = ball.BallState(jnp.asarray(-0.01))
+    _, pushed = ROLLS.control_step(jax.random.key(1), scene, due, body)
+    change = np.array(pushed.qvel - body.qvel)
+    velocity, spin = change[dof : dof + 3], change[dof + 3 : dof + 6]
+    low, high = ROLLS.push
+    assert low <= np.linalg.norm(velocity) <= high + 1e-6
+    spin_w = np.asarray(quat.rotate(qpos[adr + 3 : adr + 7], jnp.asarray(spin)))
+    below = np.array([0.0, 0.0, -ROLLS.ball_radius])
+    np.testing.assert_allclose(velocity + np.cross(spin_w, below), 0.0, atol=1e-6)
+    change[dof : dof + 6] = 0.0
+    assert not change.any()
+
+
+def test_a_ball_is_observed_where_it_rolls_and_is_lost_off_its_plate(rolling):
+    scene = rolling.scene
+    reference = rolling.references.state_at(0, 1.0)
+    _, qpos, qvel = ROLLS.reset(jax.random.key(0), scene, reference)
+    adr, dof = scene.address("ball")
+    at_first = physics.initial_state(scene, qpos, qvel)
+    first = ROLLS.observe(scene, None, at_first)
+    heading = quat.heading(qpos[3:7])
+    for off, lost in ((0.9 * ROLLS.plate, False), (1.1 * ROLLS.plate, True)):
+        move = jnp.array([off, 0.0, 0.0])
+        there = physics.initial_state(
+            scene,
+            qpos.at[adr : adr + 3].add(move),
+            qvel.at[dof : dof + 3].add(10.0 * move),
+        )
+        seen = ROLLS.observe(scene, None, there) - first
+        to_local = quat.inv(heading)
+        np.testing.assert_allclose(seen[:3], quat.rotate(to_local, move), atol=1e-5)
+        np.testing.assert_allclose(
+            seen[3:6], quat.rotate(to_local, 10.0 * move), atol=1e-5
+        )
+        assert not np.asarray(seen[6:]).any()
+        assert bool(ROLLS.terminated(scene, None, there)) is lost
+    assert float(ROLLS.reward(scene, None, there)) < float(
+        ROLLS.reward(scene, None, at_first)
+    )
+
+
+def test_a_ball_lies_still_on_its_plate_at_first(rolling):
+    """Neither does it fall on the plate nor is it thrown off by it."""
+    quiet = ROLLS.quiet()
+
+    def play(key):
+        state = rolling.reset(key)
+        waiting = ball.BallState(jnp.asarray(quiet.interval))
+        state = dataclasses.replace(state, task=waiting)
+        for _ in range(3):
+            state = rolling.step(jax.random.key(0), state, jnp.zeros(42))
+        return state.body
+
+    body = jax.jit(play)(jax.random.key(3))
+    foot, turn = ball._pole(rolling.scene, body)
+    place = quat.rotate(quat.inv(turn), ROLLS._ball(rolling.scene, body)[0] - foot)
+    np.testing.assert_allclose(place, [0.0, 0.0, ROLLS.pole_length], atol=0.01)
+    np.testing.assert_allclose(place[2], ROLLS.pole_length, atol=1e-3)
+
+
 def test_numbers_that_make_no_ball_are_refused():
     with pytest.raises(ValueError, match=r"task\.pole_length must be positive, got 0"):
         Ball(pole_length=0.0)
     with pytest.raises(ValueError, match=r"task\.head_force must be 0 or more, got -1"):
         Ball(head_force=-1.0)
+    with pytest.raises(ValueError, match=r"task\.plate must be positive, got 0"):
+        Ball(plate=0.0)

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import mujoco
 
 from dcc_jax import draws, physics, quat
-from dcc_jax.character import CONTROL_DT, CONTROL_RATE
+from dcc_jax.character import CONTROL_DT, CONTROL_RATE, add_contact
 from dcc_jax.env import features
 from dcc_jax.env.task import Event, Forces, Task, place_character
 from dcc_jax.motion.reference import RefState
@@ -37,6 +37,9 @@ Array = jax.Array
 CROWN = (0.02, 0.0, 0.245)  # m, in the head's frame: the top of its sphere
 HEAD_CENTRE = (0.02, 0.0, 0.14)  # m, likewise
 POLE_RADIUS = 0.012  # m
+PLATE_HALF_HEIGHT = 0.005  # m
+PLATE_MASS = 0.2  # kg
+FRICTION = 0.8  # of the ball on the plate
 
 
 @flax.struct.dataclass
@@ -74,6 +77,10 @@ class Ball(Task):
     pole_length: float = 1.0
     """Distance from the pivot to the middle of the ball, m; the paper gives none. A
     longer pole tips more slowly."""
+    rolls: bool = False
+    """The ball lies on a plate at the tip and rolls, instead of being fixed there."""
+    plate: float = 0.2
+    """Half the side of that plate, m."""
     pole_mass: float = 0.2
     """Mass of the pole, kg, spread along it."""
     ball_radius: float = 0.12
@@ -100,7 +107,7 @@ class Ball(Task):
 
     def __post_init__(self) -> None:
         positive = ("pole_length", "pole_mass", "ball_radius", "ball_mass", "interval")
-        for name in positive:
+        for name in (*positive, "plate"):
             value = getattr(self, name)
             if not 0.0 < value < math.inf:
                 raise ValueError(f"task.{name} must be positive, got {value}")
@@ -114,7 +121,7 @@ class Ball(Task):
         return dataclasses.replace(self, interval=1e9)
 
     def extend(self, spec: mujoco.MjSpec) -> None:
-        """Pole and ball, and the ball joint that stands them on the crown."""
+        """Pole and ball, and the ball joint that stands the pole on the crown."""
         pole = spec.worldbody.add_body(name="pole", pos=[0.0, 0.0, 2.0])
         pole.add_freejoint(name="pole")
         rod = pole.add_geom(
@@ -125,16 +132,34 @@ class Ball(Task):
             mass=self.pole_mass,
             rgba=[0.45, 0.38, 0.30, 1.0],
         )
-        ball = pole.add_geom(
+        geoms = [rod]
+        holder, place = pole, [0.0, 0.0, self.pole_length]
+        if self.rolls:
+            top = self.pole_length - self.ball_radius
+            rod.fromto[5] = top - 2.0 * PLATE_HALF_HEIGHT
+            plate = pole.add_geom(
+                name="plate",
+                type=mujoco.mjtGeom.mjGEOM_BOX,
+                pos=[0.0, 0.0, top - PLATE_HALF_HEIGHT],
+                size=[self.plate, self.plate, PLATE_HALF_HEIGHT],
+                mass=PLATE_MASS,
+                rgba=[0.85, 0.82, 0.75, 1.0],
+            )
+            geoms.append(plate)
+            holder, place = spec.worldbody.add_body(name="ball"), [0.0, 0.0, 0.0]
+            holder.add_freejoint(name="ball")
+        ball = holder.add_geom(
             name="ball",
             type=mujoco.mjtGeom.mjGEOM_SPHERE,
-            pos=[0.0, 0.0, self.pole_length],
+            pos=place,
             size=[self.ball_radius, 0, 0],
             mass=self.ball_mass,
             rgba=[0.9, 0.45, 0.1, 1.0],
         )
-        for geom in (rod, ball):
+        for geom in (*geoms, ball):
             geom.contype, geom.conaffinity = 0, 0
+        if self.rolls:
+            add_contact(spec, "ball", "plate", FRICTION)
         pole.add_site(name="foot_of_pole")
         spec.body("head").add_site(name="crown", pos=list(CROWN))
         spec.add_equality(
@@ -155,12 +180,16 @@ class Ball(Task):
         crown = _on_head(reference.qpos, CROWN)
         velocity = CONTROL_RATE * (crown - _on_head(reference.qpos_previous, CROWN))
         q_adr, v_adr = scene.address("pole")
-        pose = jnp.concatenate([crown, quat.exp(jnp.stack([*lean, jnp.zeros(())]))])
-        return (
-            BallState(wait),
-            qpos.at[q_adr : q_adr + 7].set(pose),
-            qvel.at[v_adr : v_adr + 3].set(velocity),
-        )
+        turn = quat.exp(jnp.stack([*lean, jnp.zeros(())]))
+        qpos = qpos.at[q_adr : q_adr + 7].set(jnp.append(crown, turn))
+        qvel = qvel.at[v_adr : v_adr + 3].set(velocity)
+        if self.rolls:
+            q_adr, v_adr = scene.address("ball")
+            tip = jnp.array([0.0, 0.0, self.pole_length])
+            place = crown + quat.rotate(turn, tip)
+            qpos = qpos.at[q_adr : q_adr + 7].set(jnp.append(place, turn))
+            qvel = qvel.at[v_adr : v_adr + 3].set(velocity)
+        return BallState(wait), qpos, qvel
 
     def control_step(
         self, key: Array, scene: physics.Scene, state: BallState, body: physics.State
@@ -173,9 +202,17 @@ class Ball(Task):
         return BallState(waited - CONTROL_DT), body
 
     def _pushed(self, key: Array, scene: physics.Scene, body: physics.State) -> Array:
-        """Velocities [nv] after an impulse on the ball; the pivot stays as it moves."""
+        """Velocities [nv] after an impulse on the ball. It rolls as fast as it goes;
+        where it is fixed, the pivot stays as it moves."""
         side, speed = draws.uniform(key, (-jnp.pi, jnp.pi), self.push)
         change_w = speed * jnp.stack([jnp.cos(side), jnp.sin(side), jnp.zeros(())])
+        if self.rolls:
+            q_adr, v_adr = scene.address("ball")
+            axis = jnp.stack([-change_w[1], change_w[0], change_w[2]])
+            to_ball = quat.inv(body.qpos[q_adr + 3 : q_adr + 7])
+            spin = quat.rotate(to_ball, axis / self.ball_radius)
+            change = jnp.append(change_w, spin)
+            return body.qvel.at[v_adr : v_adr + 6].add(change)
         q_adr, v_adr = scene.address("pole")
         change = quat.rotate(quat.inv(body.qpos[q_adr + 3 : q_adr + 7]), change_w)
         # omega x r = change, for r along the pole's own z axis.
@@ -211,8 +248,8 @@ class Ball(Task):
         origin, heading = features.local_frame(scene.character_qpos(body.qpos))
         to_local = quat.inv(heading)
         numbers = []
-        for height in (self.pole_length, 0.5 * self.pole_length):
-            position, velocity = _along_pole(scene, body, height)
+        middle = _along_pole(scene, body, 0.5 * self.pole_length)
+        for position, velocity in (self._ball(scene, body), middle):
             numbers += [position - origin, velocity]
         return quat.rotate(to_local, jnp.stack(numbers)).reshape(-1)
 
@@ -225,8 +262,14 @@ class Ball(Task):
     def terminated(
         self, scene: physics.Scene, state: BallState, body: physics.State
     ) -> Array:
-        """The ball is lost."""
-        return _upright(scene, body) < math.cos(self.dropped)
+        """The ball is lost: the pole leans too far, or the ball is off its plate."""
+        lost = _upright(scene, body) < math.cos(self.dropped)
+        if self.rolls:
+            foot, turn = _pole(scene, body)
+            ball, _ = self._ball(scene, body)
+            on_plate = quat.rotate(quat.inv(turn), ball - foot)
+            lost |= jnp.any(jnp.abs(on_plate[:2]) > self.plate)
+        return lost
 
     def evaluate(
         self, scene: physics.Scene, state: BallState, body: physics.State
@@ -237,9 +280,16 @@ class Ball(Task):
         return {"offset": offset, "lean": lean}
 
     def _offset(self, scene: physics.Scene, body: physics.State) -> Array:
-        ball, _ = _along_pole(scene, body, self.pole_length)
+        ball, _ = self._ball(scene, body)
         head = _on_head(scene.character_qpos(body.qpos), HEAD_CENTRE)
         return (ball - head)[:2]
+
+    def _ball(self, scene: physics.Scene, body: physics.State) -> tuple[Array, Array]:
+        """World position [3] and velocity [3] of the ball."""
+        if not self.rolls:
+            return _along_pole(scene, body, self.pole_length)
+        q_adr, v_adr = scene.address("ball")
+        return body.qpos[q_adr : q_adr + 3], body.qvel[v_adr : v_adr + 3]
 
 
 def _on_head(q: Array, offset: tuple[float, float, float]) -> Array:
@@ -252,8 +302,8 @@ def _along_pole(
     scene: physics.Scene, body: physics.State, height: float
 ) -> tuple[Array, Array]:
     """World position [3] and velocity [3] of the point at a height of the pole."""
-    q_adr, v_adr = scene.address("pole")
-    foot, turn = body.qpos[q_adr : q_adr + 3], body.qpos[q_adr + 3 : q_adr + 7]
+    _, v_adr = scene.address("pole")
+    foot, turn = _pole(scene, body)
     linear, angular = body.qvel[v_adr : v_adr + 3], body.qvel[v_adr + 3 : v_adr + 6]
     point = jnp.array([0.0, 0.0, height])
     swing = quat.rotate(turn, jnp.cross(angular, point))
@@ -262,6 +312,11 @@ def _along_pole(
 
 def _upright(scene: physics.Scene, body: physics.State) -> Array:
     """Cosine of the pole's angle from the vertical."""
-    q_adr, _ = scene.address("pole")
-    up = jnp.array([0.0, 0.0, 1.0])
-    return quat.rotate(body.qpos[q_adr + 3 : q_adr + 7], up)[2]
+    _, turn = _pole(scene, body)
+    return quat.rotate(turn, jnp.array([0.0, 0.0, 1.0]))[2]
+
+
+def _pole(scene: physics.Scene, body: physics.State) -> tuple[Array, Array]:
+    """World position [3] of the pole's foot, and its orientation [4]."""
+    adr, _ = scene.address("pole")
+    return body.qpos[adr : adr + 3], body.qpos[adr + 3 : adr + 7]
