@@ -1,4 +1,4 @@
-"""Could linear feedback do it? A regulator about a pose that a task's clip passes.
+"""Could linear feedback do it? A regulator about a pose that a clip passes.
 
     python experiments/linear_feedback.py ball --time 0.5 --speed 0.05 0.1 0.2 0.3
     python experiments/linear_feedback.py chicken-fight --time 0.9 --speed 0.05 0.1 0.2
@@ -33,14 +33,17 @@ import jax.numpy as jnp  # noqa: E402
 import mujoco  # noqa: E402
 
 from dcc_jax import config, tasks  # noqa: E402
-from dcc_jax.character import CONTROL_RATE  # noqa: E402
+from dcc_jax.character import CONTROL_RATE, asset_path  # noqa: E402
 from dcc_jax.env.environment import Environment  # noqa: E402
+from dcc_jax.motion.clip import load_clip  # noqa: E402
+from dcc_jax.motion.reference import make_references  # noqa: E402
 from dcc_jax.tasks.ball import Ball  # noqa: E402
 
 TARGETS = 36
 PROBE = 2e-3  # m, rad, m/s, rad/s: of the differences
 NEVER = 1e6  # s until the task disturbs
 EVENTS = {"ball": "next_push", "chicken-fight": "next_attack"}
+CLIPS = {"ball": "stand", "chicken-fight": "hop"}
 TRIALS, SECONDS = 64, 5.0
 POSITION, VELOCITY, EFFORT = 1.0, 0.05, 1.0  # weights of the regulator
 LIMIT = 1.5  # rad, of a target's distance from the equilibrium's
@@ -52,7 +55,8 @@ class System:
     def __init__(self, environment: Environment, time: float) -> None:
         self.model = environment.scene.model
         self.nv = self.model.nv
-        reference = environment.references.state_at(0, time)
+        clip = load_clip(asset_path(f"motions/{CLIPS[environment.task.name]}.npz"))
+        reference = make_references([clip]).state_at(0, time)
         still = dataclasses.replace(
             reference,
             qvel=jnp.zeros_like(reference.qvel),

@@ -383,13 +383,36 @@ def test_a_ball_is_observed_where_it_rolls_and_is_lost_off_its_plate(rolling):
     )
 
 
+def test_a_plate_that_leans_has_the_ball_on_it_and_loses_it_on_every_side(rolling):
+    scene, model = rolling.scene, rolling.scene.model
+    np.testing.assert_allclose(model.body("pole").mass, TASK.pole_mass + 0.2)
+    np.testing.assert_allclose(model.body("ball").mass, TASK.ball_mass)
+    tilted = dataclasses.replace(ROLLS, tilt=0.2)
+    reference = rolling.references.state_at(0, 1.0)
+    _, qpos, qvel = tilted.reset(jax.random.key(5), scene, reference)
+    foot, turn = ball._pole(scene, physics.initial_state(scene, qpos, qvel))
+    assert float(jnp.abs(turn[1:3]).max()) > 0.02, "it leans"
+    turn = quat.mul(turn, quat.exp(jnp.array([0.0, 0.0, 0.7])))
+    pole, _ = scene.address("pole")
+    qpos = qpos.at[pole + 3 : pole + 7].set(turn)
+    adr, _ = scene.address("ball")
+    tip = jnp.array([0.0, 0.0, ROLLS.pole_length])
+    place = quat.rotate(turn, tip) + foot
+    np.testing.assert_allclose(qpos[adr : adr + 3], place, atol=1e-5)
+    for side in ([1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]):
+        for share, lost in ((0.95, False), (1.05, True)):
+            on_plate = tip.at[:2].set(share * ROLLS.plate * jnp.array(side))
+            there = qpos.at[adr : adr + 3].set(foot + quat.rotate(turn, on_plate))
+            body = physics.initial_state(scene, there, qvel)
+            assert bool(ROLLS.terminated(scene, None, body)) is lost
+
+
 def test_a_ball_lies_still_on_its_plate_at_first(rolling):
     """Neither does it fall on the plate nor is it thrown off by it."""
-    quiet = ROLLS.quiet()
 
     def play(key):
         state = rolling.reset(key)
-        waiting = ball.BallState(jnp.asarray(quiet.interval))
+        waiting = ball.BallState(jnp.asarray(10.0))
         state = dataclasses.replace(state, task=waiting)
         for _ in range(3):
             state = rolling.step(jax.random.key(0), state, jnp.zeros(42))
@@ -409,3 +432,10 @@ def test_numbers_that_make_no_ball_are_refused():
         Ball(head_force=-1.0)
     with pytest.raises(ValueError, match=r"task\.plate must be positive, got 0"):
         Ball(plate=0.0)
+    for push in ((0.3, 0.05), (float("nan"), 1.0), (-1.0, 0.0)):
+        with pytest.raises(ValueError, match=r"task\.push must be a range"):
+            Ball(push=push)
+    with pytest.raises(ValueError, match=r"task\.dropped must be in"):
+        Ball(dropped=-1.0)
+    with pytest.raises(ValueError, match=r"task\.pole_length must be above 0\.13"):
+        Ball(rolls=True, pole_length=0.13)

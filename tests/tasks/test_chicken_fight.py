@@ -14,6 +14,7 @@ import pytest
 
 from dcc_jax import config, physics, tasks
 from dcc_jax.character import CONTROL_DT, asset_path, compose_scene, load_character
+from dcc_jax.motion import paths
 from dcc_jax.motion.clip import load_clip
 from dcc_jax.motion.reference import References, make_references
 from dcc_jax.tasks import chicken_fight
@@ -302,6 +303,34 @@ def test_the_reference_goes_where_its_path_goes(scene):
         )
     standing = first(jax.random.key(5), True)
     assert not standing.travel.any() and standing.time == 0.0
+
+
+def test_who_begins_at_rest_will_hop_away_from_the_box(scene):
+    references = hops()
+    first_key, key = jax.random.split(jax.random.key(6))
+    at = TASK.first_reference(first_key, references, True)
+    state, qpos, _ = TASK.reset(key, scene, at)
+    adr, _ = scene.address("box")
+    away = np.asarray(at.qpos[:2] - qpos[adr : adr + 2])
+    heading = float(state.motion.heading)
+    np.testing.assert_allclose(
+        away,
+        2.0 * TASK.distance * np.array([np.cos(heading), np.sin(heading)]),
+        atol=1e-5,
+    )
+
+
+def test_slow_hops_go_where_they_are_going(scene):
+    slow = chicken_fight.hopping_at(hops(), jnp.zeros(()), jnp.array([0.0, 0.05]))
+    state, _, _ = TASK.reset(jax.random.key(0), scene, slow)
+    np.testing.assert_allclose(state.motion.heading, np.pi / 2, atol=1e-5)
+    np.testing.assert_allclose(state.motion.speed, 0.05, rtol=1e-3)
+
+
+@pytest.mark.parametrize("speed", [-0.1, 3.0, float("nan")])
+def test_speeds_that_no_hops_have_are_refused(speed):
+    with pytest.raises(ValueError, match=r"task\.gaits\.speeds must be in"):
+        ChickenFight(gaits=paths.Gaits(speeds=(0.0, speed)))
 
 
 def test_clips_that_are_no_three_hops_are_refused():

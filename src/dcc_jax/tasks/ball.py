@@ -78,7 +78,9 @@ class Ball(Task):
     """Distance from the pivot to the middle of the ball, m; the paper gives none. A
     longer pole tips more slowly."""
     rolls: bool = False
-    """The ball lies on a plate at the tip and rolls, instead of being fixed there."""
+    """The ball lies on a plate at the tip and rolls, instead of being fixed there. To
+    learn it takes small pushes and little noise: `--task.tilt 0.01 --task.push 0 0.05
+    --ppo.sigma-degrees 1`."""
     plate: float = 0.2
     """Half the side of that plate, m."""
     pole_mass: float = 0.2
@@ -111,6 +113,17 @@ class Ball(Task):
             value = getattr(self, name)
             if not 0.0 < value < math.inf:
                 raise ValueError(f"task.{name} must be positive, got {value}")
+        low, high = self.push
+        if not 0.0 <= low <= high < math.inf:
+            raise ValueError(f"task.push must be a range of 0 or more, got {self.push}")
+        if not 0.0 < self.dropped < 0.5 * math.pi:
+            raise ValueError(f"task.dropped must be in (0, pi/2), got {self.dropped}")
+        least = self.ball_radius + 2.0 * PLATE_HALF_HEIGHT
+        if self.rolls and not self.pole_length > least:
+            raise ValueError(
+                f"task.pole_length must be above {least:g} for a ball that rolls, "
+                f"got {self.pole_length}"
+            )
         for name in ("tilt", "head_force", "root_force"):
             value = getattr(self, name)
             if not 0.0 <= value < math.inf:

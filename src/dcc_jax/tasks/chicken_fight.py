@@ -51,6 +51,8 @@ FRICTION = 0.5
 HALF_SIZE = (0.15, 0.20, 0.45)  # m, of the box: a trunk's depth, width and height
 BOX_HEIGHT = 1.1  # m, of its middle
 LONG = 100.0  # s, since a bump that never was
+FASTEST = 0.42  # m/s, of the loops that travel
+STILL = 1e-3  # m/s, below which hops go nowhere
 
 
 @flax.struct.dataclass
@@ -68,7 +70,11 @@ class ChickenFightState:
 
 @dataclass(frozen=True)
 class ChickenFight(Task):
-    """Hop, and take a bump without falling."""
+    """Hop, and take a bump without falling.
+
+    Raises:
+        ValueError: speeds that no hops have.
+    """
 
     name: ClassVar[str] = "chicken-fight"
     clips: ClassVar[tuple[str, ...]] = (
@@ -85,7 +91,7 @@ class ChickenFight(Task):
         "env.fall_height": 0.65,
     }
     """Noise of 6 degrees throws even a linear-quadratic regulator off one leg. Hops
-    take the pelvis down to 0.76 m: what is far below is a fall, of which less is seen
+    take the pelvis down to 0.84 m: what is far below is a fall, of which less is seen
     then."""
 
     prefix: str = ""
@@ -106,6 +112,14 @@ class ChickenFight(Task):
     """Time from the first touch until the box begins to brake, s."""
     brake_time: float = 0.2
     """Time constant of the box's braking, s."""
+
+    def __post_init__(self) -> None:
+        for speed in self.gaits.speeds:
+            if not 0.0 <= speed <= FASTEST:
+                raise ValueError(
+                    f"task.gaits.speeds must be in [0, {FASTEST}] for chicken-fight, "
+                    f"got {speed}"
+                )
 
     def quiet(self) -> ChickenFight:
         """Nobody attacks."""
@@ -151,7 +165,7 @@ class ChickenFight(Task):
         at: RefState,
         elapsed: float,
     ) -> RefState:
-        """The hops go on, their root on its path."""
+        """The hops go on, their root on its path: `qpos`, `travel` and `qvel[:2]`."""
         later = super().reference(references, state, at, elapsed)
         motion = state.motion
         position, heading, speed = paths.path(motion, motion.time + elapsed)
@@ -161,6 +175,7 @@ class ChickenFight(Task):
             later,
             qpos=planar_moved(pose, state.facing, position),
             qvel=later.qvel.at[:2].set(speed * paths.direction(heading)),
+            travel=speed * paths.direction(heading),
         )
 
     def reset(
@@ -170,7 +185,10 @@ class ChickenFight(Task):
         draw_key, motion_key = jax.random.split(key)
         way, wait = draws.uniform(draw_key, (-jnp.pi, jnp.pi), (0.0, self.interval))
         root, travel = reference.qpos[:2], reference.travel
-        motion = paths.begin(motion_key, self.gaits, root, travel, way, sway=0.1)
+        # Away from the box where it begins at rest; hops do not sway.
+        motion = paths.begin(
+            motion_key, self.gaits, root, travel, way + jnp.pi, sway=STILL
+        )
         state = ChickenFightState(
             motion=motion,
             facing=jnp.zeros(()),

@@ -109,7 +109,7 @@ class Match:
             distance: m between the roots at the reset.
 
         Raises:
-            ValueError: the two do not step at the same rate.
+            ValueError: the two do not step at the same rate, or one does not hop.
         """
         rates = first.config.physics_rate, second.config.physics_rate
         if rates[0] != rates[1]:
@@ -124,9 +124,10 @@ class Match:
         )
         iterations = max(first.scene.newton_iterations, second.scene.newton_iterations)
         scenes = _shared(model, characters, iterations)
+        gaits = _gaits(first), _gaits(second)
         self.fighters = (
-            Fighter(opponent=RIVAL + ROOT),
-            Fighter(prefix=RIVAL, opponent=ROOT),
+            Fighter(opponent=RIVAL + ROOT, gaits=gaits[0]),
+            Fighter(prefix=RIVAL, opponent=ROOT, gaits=gaits[1]),
         )
         self.sides = (
             first.elsewhere(scenes[0], self.fighters[0]),
@@ -200,6 +201,13 @@ class Match:
         return seeing[0], seeing[1]
 
 
+def _gaits(environment: Environment) -> paths.Gaits:
+    task = environment.task
+    if not isinstance(task, ChickenFight):
+        raise ValueError(f"a match needs two of chicken-fight, got {task.name}")
+    return task.gaits
+
+
 def _rival(character: Character) -> Callable[[mujoco.MjSpec], None]:
     """Adds a second character to a scene that has one and a floor."""
 
@@ -241,8 +249,11 @@ def _stood(side: Environment, state: EnvState, turn: float, spot: Array) -> EnvS
     # It turns about the world's origin, and stands beside that already.
     spot = spot - planar_moved(here, angle, jnp.zeros(2))[:2]
     q = planar_moved(here, angle, spot)
-    qd = scene.character_qvel(body.qvel)
-    qd = qd.at[:3].set(quat.rotate(about_z, qd[:3]))
+
+    def turned(velocity: Array) -> Array:
+        return velocity.at[:3].set(quat.rotate(about_z, velocity[:3]))
+
+    qd = turned(scene.character_qvel(body.qvel))
     qpos = jax.lax.dynamic_update_slice(body.qpos, q, (scene.qpos_adr,))
     qvel = scene.scatter_character(qd)
     return dataclasses.replace(
@@ -250,7 +261,11 @@ def _stood(side: Environment, state: EnvState, turn: float, spot: Array) -> EnvS
         body=dataclasses.replace(body, qpos=qpos, qvel=qvel),
         q_previous=planar_moved(state.q_previous, angle, spot),
         reference=dataclasses.replace(
-            reference, qpos=planar_moved(reference.qpos, angle, spot)
+            reference,
+            qpos=planar_moved(reference.qpos, angle, spot),
+            qvel=turned(reference.qvel),
+            qpos_previous=planar_moved(reference.qpos_previous, angle, spot),
+            travel=quat.rotate(about_z, jnp.append(reference.travel, 0.0))[:2],
         ),
         task=dataclasses.replace(state.task, facing=angle),
     )
