@@ -90,7 +90,7 @@ class ChickenFight(Task):
         "ppo.sigma_degrees": 3.0,
         "env.fall_height": 0.65,
     }
-    """Noise of 6 degrees throws even a linear-quadratic regulator off one leg. Hops
+    """Noise of 6 degrees throws a linear-quadratic regulator off one leg, too. Hops
     take the pelvis down to 0.84 m: what is far below is a fall, of which less is seen
     then."""
 
