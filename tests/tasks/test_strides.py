@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
+from dcc_jax import config, tasks
 from dcc_jax.character import CONTROL_DT, asset_path, compose_scene, load_character
 from dcc_jax.motion import planner
 from dcc_jax.motion.clip import load_clip
@@ -119,6 +122,14 @@ def test_what_it_begins_with_moves_as_it_says(references, loops, speed):
 def test_clips_that_make_no_planner_are_refused(names, reason):
     with pytest.raises(ValueError, match=reason):
         planner.strides(_references(*names))
+
+
+@pytest.mark.parametrize("task", ["chicken-fight", "hand-in-hand", "sustained-push"])
+def test_clips_that_do_not_suit_the_task_are_refused_before_anything_is_traced(task):
+    made = config.make_config(task)
+    env = dataclasses.replace(made.env, clips=("backflip",))
+    with pytest.raises(ValueError, match=r"env\.clips must be .*loops"):
+        tasks.make_environment(made.task, env)
 
 
 def test_the_velocity_as_it_goes_on_is_that_of_its_poses(references, loops):

@@ -376,6 +376,7 @@ class Environment:
         return self.task.root_target(self.scene, state.task, state.start, state.time)
 
     def _check(self) -> None:
+        self.task.check_clips(self.references)
         if self.tracks_reference and not self.task.trackable:
             raise ValueError(
                 "env.imitation must be 'adversarial' for task "

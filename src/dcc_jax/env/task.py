@@ -112,6 +112,14 @@ class Task:
         """The same without disturbances at random; itself where it has none."""
         return self
 
+    def check_clips(self, references: References) -> None:
+        """Nothing, where the clips suit the task.
+
+        Raises:
+            ValueError: they do not.
+        """
+        del references
+
     def first_reference(
         self, key: Array, references: References, begin: bool
     ) -> RefState:

@@ -91,15 +91,15 @@ def strides(references: References) -> Strides:
     """
     for name, loop in zip(references.names, np.asarray(references.loop), strict=True):
         if not loop:
-            raise ValueError(f"clips must be loops, {name} is none")
+            raise ValueError(f"env.clips must be loops, {name} is none")
     duration = np.asarray(references.duration)
     speeds = np.linalg.norm(np.asarray(references.shift), axis=1) / duration
     order = np.argsort(speeds)
     if len(order) < 2 or np.diff(speeds[order]).min() < 1e-3:
-        raise ValueError("clips must be two loops or more, of different speeds")
+        raise ValueError("env.clips must be two loops or more, of different speeds")
     cadences = np.where(speeds > STANDS, 1.0 / duration, np.nan)[order]
     if not np.isfinite(cadences[1:]).all():
-        raise ValueError("clips must have one stand at most, the others must stride")
+        raise ValueError("env.clips must have one stand at most; others must stride")
     cadences[0] = cadences[0] if np.isfinite(cadences[0]) else cadences[1]
     return Strides(
         clips=tuple(int(i) for i in order),

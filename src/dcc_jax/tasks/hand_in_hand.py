@@ -99,6 +99,10 @@ class HandInHand(Task):
         joint.solref = [TIME_CONSTANT, 1.0]
         joint.solimp = [IMPEDANCE, IMPEDANCE, 0.001, 0.5, 2.0]
 
+    def check_clips(self, references: References) -> None:
+        """Loops of different speeds."""
+        planner.strides(references)
+
     def first_reference(
         self, key: Array, references: References, begin: bool
     ) -> RefState:

@@ -76,6 +76,10 @@ class SustainedPush(Task):
         """Nobody pushes."""
         return dataclasses.replace(self, strength=(0.0, 0.0))
 
+    def check_clips(self, references: References) -> None:
+        """Loops of different speeds."""
+        planner.strides(references)
+
     def first_reference(
         self, key: Array, references: References, begin: bool
     ) -> RefState:
