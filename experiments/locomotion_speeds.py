@@ -9,10 +9,7 @@ own at that speed, whether the feet take turns, and how fast a standing sole sli
 
 from __future__ import annotations
 
-import argparse
-import dataclasses
 from dataclasses import dataclass
-from pathlib import Path
 from typing import ClassVar
 
 from dcc_jax import runtime
@@ -23,6 +20,7 @@ if __name__ == "__main__":
 import jax
 import jax.numpy as jnp
 import numpy as np
+from commanded import played, steady, straight
 
 from dcc_jax import physics, quat
 from dcc_jax.character import BODIES, CONTROL_DT, CONTROL_RATE, asset_path
@@ -30,9 +28,7 @@ from dcc_jax.env import features
 from dcc_jax.motion import planner
 from dcc_jax.motion.clip import load_clip
 from dcc_jax.motion.reference import RefState, make_references
-from dcc_jax.play.player import Player
 from dcc_jax.play.recording import Recording
-from dcc_jax.play.runs import find_run, make_environment
 from dcc_jax.tasks.locomotion import Locomotion, LocomotionState
 
 SPEEDS = (0.0, 0.5, 0.8, 1.2, 1.6, 2.0, 2.5, 3.0)
@@ -52,9 +48,7 @@ class Commanded(Locomotion):
         """As ever, and then it wants one of the speeds."""
         speed_key, key = jax.random.split(key)
         state, qpos, qvel = super().reset(key, scene, reference)
-        speed = jax.random.choice(speed_key, jnp.array(SPEEDS))
-        forever = jnp.asarray(1e6)
-        motion = dataclasses.replace(state.motion, wanted_speed=speed, left=forever)
+        motion = steady(speed_key, state.motion, SPEEDS)
         return LocomotionState(motion), qpos, qvel
 
 
@@ -153,34 +147,15 @@ def _alternate(steps: list[int]) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    add = parser.add_argument
-    add("run", type=Path, metavar="RUN_DIR|NAME")
-    add("--episodes", type=int, default=256)
-    add("--seconds", type=float, default=10.0)
-    add("--alpha", type=float, default=0.0)
-    add("--seed", type=int, default=0)
-    options = parser.parse_args()
-    run = find_run(options.run)
-    task = run.config.task
-    if not isinstance(task, Locomotion):
-        parser.error(f"{options.run} is a policy of {task.name}")
-    straight = dataclasses.replace(task.gaits, turn_rate=0.0)
-    player = Player(make_environment(run, Commanded(gaits=straight)))
-    recording = player.play(
-        run,
-        np.arange(options.episodes),
-        np.full(options.episodes, options.alpha),
-        seed=options.seed,
-        seconds=options.seconds,
-        motion=True,
+    recording, scene = played(
+        __doc__ or "", Locomotion, lambda task: Commanded(gaits=straight(task.gaits))
     )
     print(
         "| commanded, m/s | episodes | falls | rms error, m/s | of the command ", end=""
     )
     print("| strides/s | clips' | feet take turns | skate, cm/s |")
     print("|--:|--:|--:|--:|--:|--:|--:|--:|--:|")
-    for row in rows(recording, player.environment.scene):
+    for row in rows(recording, scene):
         share = f"{row.error / row.speed:.0%}" if row.speed else "-"
         print(
             f"| {row.speed:g} | {row.episodes} | {row.falls:.0%} | {row.error:.2f} "

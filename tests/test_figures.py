@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from dcc_jax.character import asset_path
 from dcc_jax.evaluate import bootstrap, compare
 from dcc_jax.evaluate.compare import Condition, Part
+from dcc_jax.motion.clip import load_clip
 
 ROOT = Path(__file__).resolve().parents[1]
 ARMS = [Condition("a", 0.0), Condition("a", 0.16), Condition("a", 0.16, u_on=False)]
@@ -222,6 +224,16 @@ def test_steps_of_feet_that_take_turns_and_of_one_that_drags():
     limping = speeds._steps(0.3 * np.abs(np.sin(np.pi * time)))
     assert limping == [1, 1, 1, 1] and speeds._alternate(limping) == 0.0
     assert speeds._steps(np.full(50, 0.02)) == []
+
+
+def test_hops_are_counted_by_when_they_leave_and_are_as_high_as_the_clip():
+    speeds = importlib.import_module("hop_speeds")
+    clip = load_clip(asset_path("motions/hop_cycle.npz"))
+    up = speeds.airborne(clip.qpos)
+    assert 0.2 < up.mean() < 0.35
+    twice = np.concatenate([up[:-1], up])
+    assert speeds.cadence(twice) == pytest.approx(5 / 2.4, rel=0.03)
+    assert speeds.cadence(np.zeros(60, bool)) == 0.0
 
 
 def test_error_of_a_speed_is_of_means_over_a_second():

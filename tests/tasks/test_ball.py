@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -85,6 +86,22 @@ def test_an_episode_begins_with_the_pole_on_the_crown_near_upright(environment):
     assert 0.0 < max(tilts) < np.sqrt(2.0) * TASK.tilt + 1e-3
 
 
+def undriven(scene: physics.Scene, qpos, steps: int, read) -> np.ndarray:
+    """What `read` says of the body after each physics step from rest, [steps, ...]."""
+
+    def step(body: physics.State, _):
+        kin = physics.kinematics(scene, body)
+        solution = physics.solve(scene, kin, body, jnp.zeros(scene.model.nv))
+        body = physics.integrate(scene, body, solution)
+        return body, read(body)
+
+    def go(qpos):
+        body = physics.initial_state(scene, qpos, jnp.zeros(scene.model.nv))
+        return jax.lax.scan(step, body, None, length=steps)[1]
+
+    return np.asarray(jax.jit(go)(qpos), float)
+
+
 # The pendulum.
 
 
@@ -109,17 +126,7 @@ def tipping(pinned) -> np.ndarray:
     pose = jnp.asarray(np.concatenate([crown, lean]), jnp.float32)
     start = start.at[q_adr : q_adr + 7].set(pose)
 
-    def step(body: physics.State, _):
-        kin = physics.kinematics(pinned, body)
-        solution = physics.solve(pinned, kin, body, jnp.zeros(pinned.model.nv))
-        body = physics.integrate(pinned, body, solution)
-        return body, ball._upright(pinned, body)
-
-    def fall(qpos):
-        body = physics.initial_state(pinned, qpos, jnp.zeros(pinned.model.nv))
-        return jax.lax.scan(step, body, None, length=180)[1]
-
-    return np.arccos(np.asarray(jax.jit(fall)(start), float))
+    return np.arccos(undriven(pinned, start, 180, partial(ball._upright, pinned)))
 
 
 def test_the_pole_tips_at_the_analytic_rate(pinned, tipping):
@@ -315,17 +322,9 @@ def test_a_ball_rolls_down_its_plate_at_five_sevenths_of_the_slope(
         adr = int(model.joint(name).qposadr[0])
         qpos[adr : adr + 7] = np.append(place, turn)
 
-    def step(body: physics.State, _):
-        kin = physics.kinematics(scene, body)
-        solution = physics.solve(scene, kin, body, jnp.zeros(model.nv))
-        body = physics.integrate(scene, body, solution)
-        return body, body.qvel[sphere : sphere + 6]
-
-    def roll(qpos):
-        body = physics.initial_state(scene, qpos, jnp.zeros(model.nv))
-        return jax.lax.scan(step, body, None, length=72)[1]
-
-    speed = np.asarray(jax.jit(roll)(jnp.asarray(qpos, jnp.float32)), float)
+    speed = undriven(
+        scene, jnp.asarray(qpos, jnp.float32), 72, lambda b: b.qvel[sphere : sphere + 6]
+    )
     down = np.array([np.cos(lean), 0.0, -np.sin(lean)])
     turning = np.linalg.norm(speed[:, 3:], axis=1) * ROLLS.ball_radius
     expected = 5.0 / 7.0 * GRAVITY * np.sin(lean)
