@@ -31,14 +31,14 @@ def pairs(
     later, and the clip's phase [n] then."""
     windows, phase = references.sample_windows(key, spans)
 
-    def of_pose(q: Array, before: Array) -> Array:
+    def of_pose(before: Array, q: Array) -> Array:
         bodies = features.body_features(tables.kinematics, q, before)
         sliding = mechanics.sliding(tables, q, before)
         return seen(bodies, sliding, velocity_time)
 
-    pair = jax.vmap(of_pose)
-    s, s_next = pair(windows[:, 1], windows[:, 0]), pair(windows[:, 3], windows[:, 2])
-    return s, s_next, phase
+    before, q = windows[:, 0::2], windows[:, 1::2]  # [n, 2, 55]: of s and of s'
+    both = jax.vmap(jax.vmap(of_pose))(before, q)
+    return both[:, 0], both[:, 1], phase
 
 
 def lead(character: Character, control_dt: float) -> float:

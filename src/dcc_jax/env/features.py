@@ -20,7 +20,7 @@ and has noise on what it sees, hardly sees it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -58,7 +58,10 @@ _PRODUCT = np.array(
 
 @dataclass(frozen=True, eq=False)
 class Kinematics:
-    """The static tree of one character: a free root, ball joints, welded bodies."""
+    """The static tree of one character: a free root, ball joints, welded bodies.
+
+    Indices are int32: jax takes them as they are, whether it is set to 64 bits or not.
+    """
 
     coords: quat.Coordinates
     parents: np.ndarray  # [15] index of each body's parent; the root names itself
@@ -78,7 +81,7 @@ class Kinematics:
         bodies = range(1, model.nbody)
         for body in bodies:
             _check_body(model, body)
-        parents = np.maximum(model.body_parentid[1:] - 1, 0)
+        parents = np.maximum(model.body_parentid[1:] - 1, 0).astype(np.int32)
         offset = model.body_pos[1:].copy()
         offset[0] = 0.0
         ancestors = np.eye(len(parents))
@@ -90,9 +93,10 @@ class Kinematics:
             parents=parents,
             offset=offset,
             ancestors=ancestors,
-            quat_qpos=np.array([_quat_qpos(model, body) for body in bodies]),
+            quat_qpos=np.array([_quat_qpos(model, body) for body in bodies], np.int32),
             levels=tuple(
-                np.flatnonzero(depth == d) for d in range(2, int(depth.max()) + 1)
+                np.flatnonzero(depth == d).astype(np.int32)
+                for d in range(2, int(depth.max()) + 1)
             ),
         )
 
@@ -125,6 +129,7 @@ def _quat_qpos(model: mujoco.MjModel, body: int) -> range:
     return range(start, start + 4)
 
 
+@partial(jax.jit, static_argnums=0)  # traced once, however often a program has it
 def body_poses(kinematics: Kinematics, q: Array) -> tuple[Array, Array]:
     """World positions [15, 3] in m and orientations [15, 4] of the bodies at q [55]."""
     welded = jnp.array([1.0, 0.0, 0.0, 0.0], q.dtype)
@@ -171,6 +176,7 @@ def local_frame(q: Array) -> tuple[Array, Array]:
     return origin, quat.heading(q[3:7])
 
 
+@partial(jax.jit, static_argnums=0)
 def body_features(kinematics: Kinematics, q: Array, q_previous: Array) -> Array:
     """The bodies of one state, [270]; layout in the module docstring.
 

@@ -50,6 +50,15 @@ class Running:
     steps: Array  # [B] int32 control steps since the reset
     earlier: Array  # [B, K - 1, F] features before now, oldest first
 
+    @classmethod
+    def of(cls, env: Any, span: int) -> Running:
+        """Episodes that begin with the resets `env`, every leaf [B, ...], and K."""
+        return cls(
+            env=env,
+            steps=jnp.zeros(env.features.shape[0], jnp.int32),
+            earlier=jnp.repeat(env.features[:, None], span - 1, axis=1),
+        )
+
     @property
     def span(self) -> int:
         """K."""
@@ -111,11 +120,7 @@ def reset_all(
         span: K.
     """
     env = jax.vmap(lambda key: environment.reset(key, alpha))(keys)
-    return Running(
-        env=env,
-        steps=jnp.zeros(keys.shape[0], jnp.int32),
-        earlier=jnp.repeat(env.features[:, None], span - 1, axis=1),
-    )
+    return Running.of(env, span)
 
 
 def rollout(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import flax.struct
 import jax
@@ -18,7 +18,7 @@ from dcc_jax.learn import discriminator, networks, normalizer, ppo, warm_start
 from dcc_jax.learn.discriminator import DiscriminatorConfig
 from dcc_jax.learn.exchange import all_gather_tree
 from dcc_jax.learn.ppo import PpoConfig
-from dcc_jax.learn.rollout import Environment, Incident, Policy, Running, reset_all
+from dcc_jax.learn.rollout import Environment, Incident, Policy, Running
 
 Array = jax.Array
 AXIS = "env"  # mesh axis over which the environments are sharded
@@ -240,17 +240,21 @@ def _begun(
     rounds = max(-(-samples // size), 1)
     keys = jax.random.split(key, (rounds, size))
 
-    def one(_: Running, keys: Array) -> tuple[Running, tuple[Array, Array]]:
-        begun = reset_all(keys, environment, alpha, span)
-        action = jax.vmap(environment.expert_action)(begun.env)
-        return begun, (begun.env.obs, action)
+    def reset(key: Array) -> Any:
+        return environment.reset(key, alpha)
 
-    shapes = jax.eval_shape(lambda: reset_all(keys[0], environment, alpha, span))
-    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    def one(_: Any, keys: Array) -> tuple[Any, tuple[Array, Array]]:
+        begun = jax.vmap(reset)(keys)
+        return begun, (begun.obs, jax.vmap(environment.expert_action)(begun))
+
+    # The shapes of one reset, which has been traced; to batch it takes a while.
+    shapes = jax.eval_shape(reset, jax.ShapeDtypeStruct((), keys.dtype))
+    nothing = jax.tree.map(lambda x: jnp.zeros((size, *x.shape), x.dtype), shapes)
     begun, shown = jax.lax.scan(one, nothing, keys)
     obs, action = (x.reshape(rounds * size, x.shape[-1]) for x in shown)
     count = samples or size
-    return jax.tree.map(lambda x: x[:local_envs], begun), obs[:count], action[:count]
+    running = Running.of(jax.tree.map(lambda x: x[:local_envs], begun), span)
+    return running, obs[:count], action[:count]
 
 
 def of_device(key: Array) -> Array:

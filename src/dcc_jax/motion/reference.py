@@ -61,6 +61,7 @@ class References:
         """From the first to the last frame of each clip, or its period, [C] s."""
         return (self.frames - 1) / self.fps
 
+    @jax.jit  # traced once, however often a program has it
     def qpos_at(self, clip: Array | int, time: Array | float) -> Array:
         """q_m(t) [55] of one clip; a loop goes on, other clips hold their ends."""
         cycle, frame, share = self._place(clip, time)
