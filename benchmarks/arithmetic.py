@@ -25,7 +25,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from dcc_jax import runtime
+from dcc_jax import command, runtime
 
 runtime.ensure(devices=1, quiet=True)
 
@@ -162,4 +162,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command.script(main)

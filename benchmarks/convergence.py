@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 
-from dcc_jax import runtime
+from dcc_jax import command, runtime
 
 runtime.ensure()
 
@@ -100,4 +100,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command.script(main)

@@ -12,7 +12,7 @@ import argparse
 
 from training import medians, update_of
 
-from dcc_jax import tasks
+from dcc_jax import command, tasks
 from dcc_jax.config import make_config
 
 
@@ -39,4 +39,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command.script(main)

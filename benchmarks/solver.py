@@ -16,7 +16,7 @@ import dataclasses
 import time
 from collections.abc import Callable
 
-from dcc_jax import runtime
+from dcc_jax import command, runtime
 
 if __name__ == "__main__":
     runtime.ensure(devices=1)
@@ -110,4 +110,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command.script(main)

@@ -18,7 +18,7 @@ from itertools import pairwise
 from typing import Any
 from unittest import mock
 
-from dcc_jax import runtime
+from dcc_jax import command, runtime
 
 runtime.ensure(devices=1)
 
@@ -93,4 +93,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command.script(main)

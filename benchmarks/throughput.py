@@ -22,7 +22,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from dcc_jax import runtime
+from dcc_jax import command, runtime
 
 runtime.ensure()
 
@@ -168,4 +168,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command.script(main)

@@ -27,7 +27,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from dcc_jax import runtime
+from dcc_jax import command, runtime
 
 runtime.ensure()
 
@@ -335,4 +335,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command.script(main)

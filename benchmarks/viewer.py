@@ -24,6 +24,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from dcc_jax import command
+
 COLUMNS = ("start, s", "step, ms", "95 %, ms", "memory, GB", "growth, MB")
 WATCHED = (
     "real time",
@@ -169,4 +171,4 @@ def _shipped() -> list[str]:
 
 
 if __name__ == "__main__":
-    main()
+    command.script(main)

@@ -19,6 +19,7 @@ from statistics import fmean
 from typing import Any
 
 import dcc_jax
+from dcc_jax import command
 from dcc_jax.training import logs
 
 OPEN = {"disc.gradient_penalty": 10.0, "disc.instance_noise": 0.0}
@@ -124,4 +125,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command.script(main)

@@ -28,7 +28,7 @@ import mujoco
 import numpy as np
 import paired
 
-from dcc_jax import runtime
+from dcc_jax import command, runtime
 from dcc_jax.evaluate import bootstrap
 from dcc_jax.evaluate.bootstrap import Interval
 
@@ -299,4 +299,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command.script(main)

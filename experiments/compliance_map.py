@@ -14,7 +14,7 @@ alone, alpha 0. `compliance_map.json` holds u and yield at the end of every push
 
 from __future__ import annotations
 
-from dcc_jax import runtime
+from dcc_jax import command, runtime
 
 if __name__ == "__main__":
     runtime.ensure()
@@ -224,4 +224,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command.script(main)

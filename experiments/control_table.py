@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import dcc_jax
-from dcc_jax import runtime
+from dcc_jax import command, runtime
 
 
 @dataclass(frozen=True)
@@ -185,4 +185,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command.script(main)

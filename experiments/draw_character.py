@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.image import imsave
 from scipy.spatial.transform import Rotation
 
+from dcc_jax import command
 from dcc_jax.character import asset_path, compose_scene, load_character
 from dcc_jax.motion.clip import load_clip
 from dcc_jax.viz import draw
@@ -70,4 +71,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command.script(main)

@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 from mpl_toolkits.mplot3d import Axes3D
 
+from dcc_jax import command
 from dcc_jax.character import load_character
 from dcc_jax.control.stiffness import (
     determinant,
@@ -114,4 +115,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command.script(main)

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 import paired
 
-from dcc_jax import runtime
+from dcc_jax import command, runtime
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -96,4 +96,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command.script(main)

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import paired
 
-from dcc_jax import runtime
+from dcc_jax import command, runtime
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -118,4 +118,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command.script(main)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from dcc_jax import quat
+from dcc_jax import command, quat
 from dcc_jax.character import BODIES, asset_path, compose_scene, load_character
 from dcc_jax.control import compliance
 from dcc_jax.control.config import ComplianceConfig
@@ -84,4 +84,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command.script(main)

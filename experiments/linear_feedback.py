@@ -24,7 +24,7 @@ import itertools
 
 import numpy as np
 
-from dcc_jax import runtime
+from dcc_jax import command, runtime
 
 runtime.ensure()
 
@@ -217,4 +217,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command.script(main)

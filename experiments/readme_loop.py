@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dcc_jax import runtime
+from dcc_jax import command, runtime
 
 if __name__ == "__main__":
     runtime.ensure()
@@ -53,4 +53,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command.script(main)

@@ -19,7 +19,7 @@ from control_table import SKILLS, Line
 from scipy import stats
 
 import dcc_jax
-from dcc_jax import runtime
+from dcc_jax import command, runtime
 
 if TYPE_CHECKING:
     from dcc_jax.evaluate.report import Report
@@ -78,4 +78,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command.script(main)

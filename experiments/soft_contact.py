@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import dcc_jax
-from dcc_jax import runtime
+from dcc_jax import command, runtime
 
 if __name__ == "__main__":
     runtime.ensure()
@@ -224,4 +224,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command.script(main)

@@ -13,7 +13,7 @@ import argparse
 
 import numpy as np
 
-from dcc_jax import runtime
+from dcc_jax import command, runtime
 
 if __name__ == "__main__":
     runtime.ensure(devices=1)
@@ -68,4 +68,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command.script(main)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import dcc_jax
-from dcc_jax import runtime
+from dcc_jax import command, runtime
 
 if __name__ == "__main__":
     runtime.ensure()
@@ -186,4 +186,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command.script(main)

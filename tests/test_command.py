@@ -192,6 +192,22 @@ def test_error_nobody_foresaw_is_one_line_with_details_in_a_file(
     assert "Traceback" in log.read_text() and str(error) in log.read_text()
 
 
+def test_script_that_fails_is_one_line_and_status_1(tmp_path):
+    experiment = tmp_path / "bad_sum.py"
+    experiment.write_text(
+        "from dcc_jax import command\n"
+        "def main():\n    raise ValueError('odd')\n"
+        "command.script(main)\n"
+    )
+    env = {**os.environ, "TMPDIR": str(tmp_path)}
+    run = subprocess.run(
+        [sys.executable, str(experiment)], capture_output=True, text=True, env=env
+    )
+    assert run.returncode == 1
+    assert run.stderr.startswith("bad_sum: ValueError: odd (details in ")
+    assert run.stderr.count("\n") == 1
+
+
 def test_error_nobody_foresaw_in_the_arguments_ends_in_no_traceback(capsys, temporary):
     def prepare(options: Options):
         raise ZeroDivisionError("one over zero")

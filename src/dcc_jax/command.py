@@ -161,6 +161,19 @@ def unforeseen(error: Exception, log: Path) -> WorkError:
     return WorkError(f"{type(error).__name__}: {reason} (details in {log})")
 
 
+def script(main: Callable[[], None]) -> NoReturn:
+    """Runs the main function of a script and ends the process with its status.
+
+    What goes wrong is one line, and the traceback lies in the file that it names.
+    """
+
+    def work() -> int:
+        main()
+        return 0
+
+    leave(_guarded(Path(sys.argv[0]).stem, work))
+
+
 def leave(status: int) -> NoReturn:
     """Ends the process at once: XLA's threads can hold up an ordinary exit."""
     for stream in (sys.stdout, sys.stderr):
