@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -97,6 +98,17 @@ def test_run_killed_at_random_and_resumed_is_the_same_run(uninterrupted, tmp_pat
     assert _comparable(run_dir) == _comparable(uninterrupted)
     ours, theirs = (checkpoint.load_policy(d) for d in (run_dir, uninterrupted))
     jax.tree.map(np.testing.assert_array_equal, ours, theirs)
+
+
+def test_resume_of_a_finished_run_compiles_nothing(uninterrupted, tmp_path):
+    run_dir = tmp_path / "again"
+    shutil.copytree(uninterrupted, run_dir)
+    process = _start(run_dir, "--resume")
+    output, _ = process.communicate(timeout=600)
+    assert process.returncode == 0, output
+    assert f"resuming {run_dir} after update {UPDATES}" in output
+    assert "compil" not in output.partition("resuming")[2]
+    assert _comparable(run_dir) == _comparable(uninterrupted)
 
 
 def test_policy_of_a_run_is_the_mean_of_those_of_its_updates(tmp_path):

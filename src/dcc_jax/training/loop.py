@@ -127,7 +127,7 @@ def _loop(run: Run, progress: logs.Progress, stop: StopSignal) -> TrainResult:
     done, nan_count = int(state.update), int(state.nan_count)
     log = logs.RunLog(run.run_dir, done) if processes.is_first() else None
     began, saved = time.perf_counter(), done
-    while done * train.tuples_per_update < train.total_tuples:
+    while not _all_collected(run, done):
         if processes.anywhere(bool(stop.name)):
             break
         before = time.perf_counter()
@@ -161,7 +161,7 @@ def _loop(run: Run, progress: logs.Progress, stop: StopSignal) -> TrainResult:
         _save(run, done, state)
     if log is not None:
         log.close()
-    finished = done * train.tuples_per_update >= train.total_tuples
+    finished = _all_collected(run, done)
     return _finish(run, done, state, finished, stop, progress.say)
 
 
@@ -174,17 +174,21 @@ def _prepared(
     shares what it has traced, and where two race for that, the program is another one
     at every start, which no compile cache holds.
     """
-    say(f"compiling for {run.mesh.size} {jax.default_backend()} device(s) ...")
+    devices = f"{run.mesh.size} {jax.default_backend()} device(s)"
     began = time.perf_counter()
     init = learner.make_init(run.environment, run.config, run.mesh, start=run.start)
     key = jax.random.key(run.config.seed)
     template = jax.eval_shape(init, key, None)
     if run.resume and checkpoint.available(run.run_dir):
         state = _restored(run, template, say)
+        if _all_collected(run, int(state.update)):
+            return state, learner.make_update(run.environment, run.config, run.mesh)
+        say(f"compiling for {devices} ...")
         compiled = _lowered(run, template).compile()
     else:
         if run.resume:
             say(f"no checkpoint in {run.run_dir}: it begins with the first update")
+        say(f"compiling for {devices} ...")
         lowered = init.lower(key, None)  # pyright: ignore[reportFunctionMemberAccess]
         with ThreadPoolExecutor(1) as beside:
             made = beside.submit(lambda: lowered.compile()(key, None))
@@ -192,6 +196,12 @@ def _prepared(
         state = made.result()
     say(f"compiled in {time.perf_counter() - began:.1f} s")
     return state, compiled
+
+
+def _all_collected(run: Run, updates: int) -> bool:
+    """Whether so many updates have collected all tuples of the run."""
+    train = run.config.train
+    return updates * train.tuples_per_update >= train.total_tuples
 
 
 def _restored(run: Run, template: TrainState, say: Callable[[str], None]) -> TrainState:
