@@ -31,14 +31,25 @@ def pairs(
     later, and the clip's phase [n] then."""
     windows, phase = references.sample_windows(key, spans)
 
-    def of_pose(before: Array, q: Array) -> Array:
-        bodies = features.body_features(tables.kinematics, q, before)
-        sliding = mechanics.sliding(tables, q, before)
-        return seen(bodies, sliding, velocity_time)
-
     before, q = windows[:, 0::2], windows[:, 1::2]  # [n, 2, 55]: of s and of s'
-    both = jax.vmap(jax.vmap(of_pose))(before, q)
+    of_both = jax.vmap(jax.vmap(lambda q, q0: of_pose(tables, q, q0, velocity_time)))
+    both = of_both(q, before)
     return both[:, 0], both[:, 1], phase
+
+
+def of_pose(
+    tables: Mechanics, q: Array, q_previous: Array, velocity_time: float
+) -> Array:
+    """What is `seen` [272] of a pose of a clip, which nothing displaces.
+
+    Args:
+        tables: of the character.
+        q: now [55], its height above the ground.
+        q_previous: the same, one control step ago.
+        velocity_time: of `pairs.weighed`, s.
+    """
+    bodies = features.body_features(tables.kinematics, q, q_previous)
+    return seen(bodies, mechanics.sliding(tables, q, q_previous), velocity_time)
 
 
 def lead(character: Character, control_dt: float) -> float:

@@ -1,0 +1,150 @@
+"""How near to its clips a motion is that goes where it is told, beside the planner's.
+
+    python experiments/style_by_speed.py locomotion [--episodes 64] [--seconds 10]
+
+Clips are steady strides of a few speeds, mostly straight ahead. Who is told to change
+speed and to turn cannot always look like one of them. So the policy stands beside a
+motion without physics: the package's loops, blended by `motion.planner` along paths of
+the same gaits. Both are measured alike, `style/nearest` by the speed of the path, at
+alpha 0 and until a fall. The last row has 95 % intervals over episodes.
+"""
+
+from __future__ import annotations
+
+import argparse
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from dcc_jax import command, runtime
+
+if __name__ == "__main__":
+    runtime.ensure()
+
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dcc_jax.character import CONTROL_DT, CONTROL_RATE, asset_path
+from dcc_jax.env import expert
+from dcc_jax.env.environment import Environment
+from dcc_jax.evaluate import bootstrap
+from dcc_jax.learn import style
+from dcc_jax.motion import paths, planner
+from dcc_jax.motion.clip import load_clip
+from dcc_jax.motion.paths import Gaits
+from dcc_jax.motion.reference import References, make_references
+from dcc_jax.play.runs import Run, find_run, make_environment
+from dcc_jax.tasks.locomotion import Locomotion
+
+Array = jax.Array
+# Of pairs [T, N, E] in m, the path's speed [T, N] in m/s, and whether nobody has
+# fallen yet [T, N].
+Seen = tuple[Array, Array, Array]
+EDGES = (0.0, 0.05, 0.6, 1.0, 1.4, 1.8, 2.2, 2.7, 3.1)  # m/s
+
+
+def policy(run: Run, environment: Environment, steps: int, key: Array) -> Seen:
+    """What the mean action does, of the episodes that begin with keys [N]."""
+
+    def step(state: Any, key: Array) -> tuple[Any, Seen]:
+        action = run.policy.mean(state.obs[None])[0]
+        after = environment.step(key, state, action)
+        pair = environment.style_coordinates(after.previous_features, after.features)
+        return after, (pair, after.task.motion.speed, ~after.terminated)
+
+    def episode(key: Array) -> Seen:
+        begin, key = jax.random.split(key)
+        state = environment.reset(begin, jnp.zeros(()))
+        return jax.lax.scan(step, state, jax.random.split(key, steps))[1]
+
+    points, speed, up = jax.jit(jax.vmap(episode, out_axes=1))(key)
+    return points, speed, jnp.cumprod(up, axis=0).astype(bool)
+
+
+def planned(
+    gaits: Gaits, loops: References, environment: Environment, steps: int, key: Array
+) -> Seen:
+    """What blended strides look like along such paths, with keys [N]."""
+    strides = planner.strides(loops)
+    tables, velocity_time = environment.mechanics, environment.config.velocity_time
+    as_seen = partial(expert.of_pose, tables, velocity_time=velocity_time)
+
+    def step(carry: Any, key: Array) -> tuple[Any, tuple[Array, Array, Array]]:
+        at, motion = carry
+        motion = paths.go_on(key, gaits, motion)
+        at = planner.go_on(loops, strides, motion, at, CONTROL_DT)
+        return (at, motion), (at.qpos, at.qpos_previous, motion.speed)
+
+    def episode(key: Array) -> tuple[Array, Array]:
+        at_key, motion_key, key = jax.random.split(key, 3)
+        at = planner.first_reference(at_key, loops, gaits, stands=False)
+        motion = planner.first_motion(motion_key, gaits, at)
+        keys = jax.random.split(key, steps + 1)
+        _, (q, before, speed) = jax.lax.scan(step, (at, motion), keys)
+        seen = jax.vmap(as_seen)(q, before)
+        return environment.style_coordinates(seen[:-1], seen[1:]), speed[1:]
+
+    points, speed = jax.jit(jax.vmap(episode, out_axes=1))(key)
+    return points, speed, jnp.ones(speed.shape, bool)
+
+
+def distances(environment: Environment, seen: Seen) -> np.ndarray:
+    """To the nearest pair of the clips [T, N] in mm; NaN after a fall."""
+    points, _, up = seen
+    reference = style.make_reference(environment)
+    found = jax.lax.map(lambda x: style.nearest(reference, x), points)
+    return np.where(up, 1e3 * np.asarray(found), np.nan)
+
+
+def rows(names: tuple[str, ...], all_seen: list[Seen], all_mm: list[np.ndarray]) -> str:
+    """The table."""
+    lines = [
+        f"| speed of the path, m/s | {' | '.join(f'{n}, mm' for n in names)} |",
+        "|--:" * (1 + len(names)) + "|",
+    ]
+    for low, high in pairwise(EDGES):
+        cells = []
+        for (_, speed, _), mm in zip(all_seen, all_mm, strict=True):
+            inside = mm[(np.asarray(speed) >= low) & (np.asarray(speed) < high)]
+            cells.append(f"{np.nanmean(inside):.0f}" if inside.size else "-")
+        lines.append(f"| {low:g} to {high:g} | {' | '.join(cells)} |")
+    cells = []
+    for mm in all_mm:
+        of_episode = np.nanmean(mm, axis=0)
+        mean = bootstrap.mean(of_episode, bootstrap.draws(len(of_episode)))
+        cells.append(f"{mean.value:.1f} [{mean.low:.1f}, {mean.high:.1f}]")
+    return "\n".join([*lines, f"| all | {' | '.join(cells)} |"])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    add = parser.add_argument
+    add("run", type=Path, metavar="RUN_DIR|NAME")
+    add("--episodes", type=int, default=64)
+    add("--seconds", type=float, default=10.0)
+    add("--seed", type=int, default=0)
+    options = parser.parse_args()
+    run = find_run(options.run)
+    task = run.config.task
+    if not isinstance(task, Locomotion):
+        parser.error(f"{options.run} is a policy of {task.name}")
+    environment = make_environment(run)
+    clips = [load_clip(asset_path(f"motions/{name}.npz")) for name in planner.LOOPS]
+    steps = round(options.seconds * CONTROL_RATE)
+    ours, theirs = jax.random.split(jax.random.key(options.seed))
+    keys = jax.random.split(ours, options.episodes)
+    plans = jax.random.split(theirs, options.episodes)
+    loops = make_references(clips)
+    seen = [
+        policy(run, environment, steps, keys),
+        planned(task.gaits, loops, environment, steps, plans),
+    ]
+    apart = [distances(environment, x) for x in seen]
+    print(rows((str(options.run), "the planner"), seen, apart))
+
+
+if __name__ == "__main__":
+    command.script(main)
