@@ -34,8 +34,8 @@ from dcc_jax.evaluate import bootstrap
 from dcc_jax.learn import style
 from dcc_jax.motion import paths, planner
 from dcc_jax.motion.clip import load_clip
-from dcc_jax.motion.paths import Gaits
-from dcc_jax.motion.reference import References, make_references
+from dcc_jax.motion.paths import Gaits, Motion
+from dcc_jax.motion.reference import References, RefState, make_references
 from dcc_jax.play.runs import Run, find_run, make_environment
 from dcc_jax.tasks.locomotion import Locomotion
 
@@ -43,51 +43,59 @@ Array = jax.Array
 # Of pairs [T, N, E] in m, the path's speed [T, N] in m/s, and whether nobody has
 # fallen yet [T, N].
 Seen = tuple[Array, Array, Array]
+Shape = tuple[int, int]  # control steps T, episodes N
 EDGES = (0.0, 0.05, 0.6, 1.0, 1.4, 1.8, 2.2, 2.7, 3.1)  # m/s
 
 
-def policy(run: Run, environment: Environment, steps: int, key: Array) -> Seen:
-    """What the mean action does, of the episodes that begin with keys [N]."""
+def policy(run: Run, environment: Environment, shape: Shape, key: Array) -> Seen:
+    """What the mean action does in episodes of T control steps."""
+    begin_key, step_key = jax.random.split(key)
 
-    def step(state: Any, key: Array) -> tuple[Any, Seen]:
-        action = run.policy.mean(state.obs[None])[0]
-        after = environment.step(key, state, action)
+    def step(state: Any, keys: Array) -> tuple[Any, Seen]:
+        action = run.policy.mean(state.obs)
+        after = jax.vmap(environment.step)(keys, state, action)
         pair = environment.style_coordinates(after.previous_features, after.features)
         return after, (pair, after.task.motion.speed, ~after.terminated)
 
-    def episode(key: Array) -> Seen:
-        begin, key = jax.random.split(key)
-        state = environment.reset(begin, jnp.zeros(()))
-        return jax.lax.scan(step, state, jax.random.split(key, steps))[1]
+    @jax.jit
+    def episodes(begin: Array, keys: Array) -> Seen:
+        reset = jax.vmap(lambda key: environment.reset(key, jnp.zeros(())))
+        return jax.lax.scan(step, reset(begin), keys)[1]
 
-    points, speed, up = jax.jit(jax.vmap(episode, out_axes=1))(key)
+    begin = jax.random.split(begin_key, shape[1])
+    points, speed, up = episodes(begin, jax.random.split(step_key, shape))
     return points, speed, jnp.cumprod(up, axis=0).astype(bool)
 
 
 def planned(
-    gaits: Gaits, loops: References, environment: Environment, steps: int, key: Array
+    gaits: Gaits, loops: References, environment: Environment, shape: Shape, key: Array
 ) -> Seen:
-    """What blended strides look like along such paths, with keys [N]."""
+    """What blended strides look like along such paths."""
     strides = planner.strides(loops)
     tables, velocity_time = environment.mechanics, environment.config.velocity_time
     as_seen = partial(expert.of_pose, tables, velocity_time=velocity_time)
 
-    def step(carry: Any, key: Array) -> tuple[Any, tuple[Array, Array, Array]]:
-        at, motion = carry
-        motion = paths.go_on(key, gaits, motion)
-        at = planner.go_on(loops, strides, motion, at, CONTROL_DT)
-        return (at, motion), (at.qpos, at.qpos_previous, motion.speed)
-
-    def episode(key: Array) -> tuple[Array, Array]:
-        at_key, motion_key, key = jax.random.split(key, 3)
+    def begun(at_key: Array, motion_key: Array) -> tuple[RefState, Motion]:
         at = planner.first_reference(at_key, loops, gaits, stands=False)
-        motion = planner.first_motion(motion_key, gaits, at)
-        keys = jax.random.split(key, steps + 1)
-        _, (q, before, speed) = jax.lax.scan(step, (at, motion), keys)
-        seen = jax.vmap(as_seen)(q, before)
+        return at, planner.first_motion(motion_key, gaits, at)
+
+    def one(at: RefState, motion: Motion, key: Array) -> tuple[RefState, Motion]:
+        motion = paths.go_on(key, gaits, motion)
+        return planner.go_on(loops, strides, motion, at, CONTROL_DT), motion
+
+    def step(carry: Any, keys: Array) -> tuple[Any, tuple[Array, Array]]:
+        at, motion = carry = jax.vmap(one)(*carry, keys)
+        return carry, (jax.vmap(as_seen)(at.qpos, at.qpos_previous), motion.speed)
+
+    @jax.jit
+    def episodes(begin: tuple[Array, Array], keys: Array) -> tuple[Array, Array]:
+        _, (seen, speed) = jax.lax.scan(step, jax.vmap(begun)(*begin), keys)
         return environment.style_coordinates(seen[:-1], seen[1:]), speed[1:]
 
-    points, speed = jax.jit(jax.vmap(episode, out_axes=1))(key)
+    at_key, motion_key, step_key = jax.random.split(key, 3)
+    begin = jax.random.split(at_key, shape[1]), jax.random.split(motion_key, shape[1])
+    keys = jax.random.split(step_key, (shape[0] + 1, shape[1]))
+    points, speed = episodes(begin, keys)
     return points, speed, jnp.ones(speed.shape, bool)
 
 
@@ -133,14 +141,12 @@ def main() -> None:
         parser.error(f"{options.run} is a policy of {task.name}")
     environment = make_environment(run)
     clips = [load_clip(asset_path(f"motions/{name}.npz")) for name in planner.LOOPS]
-    steps = round(options.seconds * CONTROL_RATE)
-    ours, theirs = jax.random.split(jax.random.key(options.seed))
-    keys = jax.random.split(ours, options.episodes)
-    plans = jax.random.split(theirs, options.episodes)
     loops = make_references(clips)
+    shape = round(options.seconds * CONTROL_RATE), options.episodes
+    ours, theirs = jax.random.split(jax.random.key(options.seed))
     seen = [
-        policy(run, environment, steps, keys),
-        planned(task.gaits, loops, environment, steps, plans),
+        policy(run, environment, shape, ours),
+        planned(task.gaits, loops, environment, shape, theirs),
     ]
     apart = [distances(environment, x) for x in seen]
     print(rows((str(options.run), "the planner"), seen, apart))

@@ -8,14 +8,20 @@ from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 from matplotlib.image import imread
 
+import dcc_jax
 from dcc_jax.character import asset_path
 from dcc_jax.evaluate import bootstrap, compare
 from dcc_jax.evaluate.compare import Condition, Part
+from dcc_jax.motion import planner
 from dcc_jax.motion.clip import load_clip
+from dcc_jax.motion.paths import Gaits
+from dcc_jax.motion.reference import make_references
+from dcc_jax.tasks import make_environment
 
 ROOT = Path(__file__).resolve().parents[1]
 ARMS = [Condition("a", 0.0), Condition("a", 0.16), Condition("a", 0.16, u_on=False)]
@@ -242,3 +248,19 @@ def test_error_of_a_speed_is_of_means_over_a_second():
     along = 2.0 + 0.4 * np.sin(2 * np.pi * 2.0 * time)  # rocks twice a second
     assert speeds._error(along, 2.0) < 1e-2
     assert speeds._error(along + 0.3, 2.0) == pytest.approx(0.3, rel=1e-3)
+
+
+def test_steady_strides_of_the_planner_are_the_clips():
+    by_speed = importlib.import_module("style_by_speed")
+    config = dcc_jax.make_config("locomotion", preset="smoke")
+    environment = make_environment(config.task, config.env)
+    clips = [load_clip(asset_path(f"motions/{name}.npz")) for name in planner.LOOPS]
+    gaits = Gaits(speeds=(1.2,), turn_rate=0.0)
+    loops, key = make_references(clips), jax.random.key(0)
+    seen = by_speed.planned(gaits, loops, environment, (30, 4), key)
+    assert np.nanmax(by_speed.distances(environment, seen)) < 20.0
+    points, speed, up = seen
+    np.testing.assert_allclose(speed, 1.2, atol=1e-3)
+    assert by_speed.distances(environment, (0.9 * points, speed, up)).min() > 25.0
+    fallen = (points, speed, up.at[10:].set(False))
+    assert np.isnan(by_speed.distances(environment, fallen)[10:]).all()
