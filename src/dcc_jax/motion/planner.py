@@ -43,6 +43,7 @@ class Strides:
     speeds: tuple[float, ...]  # m/s
     cadences: tuple[float, ...]  # strides a second; a stand has the next loop's
     offsets: tuple[float, ...]  # share of the period at which a stride begins
+    centers: tuple[tuple[float, float], ...]  # m, root less an even motion, on average
 
     def cadence(self, speed: Array) -> Array:
         """Strides a second at a speed."""
@@ -51,7 +52,10 @@ class Strides:
     def pose(
         self, references: References, phase: Array, speed: Array, time: Array
     ) -> Array:
-        """qpos [55] at a phase of the stride, over the origin, heading along x.
+        """qpos [55] at a phase of the stride, heading along x.
+
+        What moves evenly is over the origin: the root sways about it as in the loops,
+        or soles that stand would slide.
 
         Args:
             references: of which these are the loops.
@@ -69,7 +73,7 @@ class Strides:
         share = jnp.clip(share, 0.0, 1.0)
         scalars = scalars + share * (more_scalars - scalars)
         blended = quat.slerp(quats, more_quats, share)
-        return references.coords.join_q(scalars, blended).at[:2].set(0.0)
+        return references.coords.join_q(scalars, blended)
 
     def _of(
         self, references: References, index: Array, phase: Array, time: Array
@@ -77,8 +81,10 @@ class Strides:
         clip = jnp.array(self.clips)[index]
         stride = (phase + jnp.array(self.offsets)[index]) % 1.0
         strides = jnp.array(self.speeds)[index] > STANDS
-        at = jnp.where(strides, stride * references.duration[clip], time)
-        return references.qpos_at(clip, at)
+        duration = references.duration[clip]
+        at = jnp.where(strides, stride * duration, time)
+        even = jnp.array(self.centers)[index] + at / duration * references.shift[clip]
+        return references.qpos_at(clip, at).at[:2].add(-even)
 
 
 @jax.ensure_compile_time_eval()
@@ -106,6 +112,7 @@ def strides(references: References) -> Strides:
         speeds=tuple(float(x) for x in speeds[order]),
         cadences=tuple(float(x) for x in cadences),
         offsets=tuple(_offset(references, int(i)) for i in order),
+        centers=tuple(_center(references, int(i)) for i in order),
     )
 
 
@@ -129,21 +136,25 @@ def first_reference(
 
 
 def first_motion(key: Array, gaits: Gaits, reference: RefState) -> Motion:
-    """A motion that goes on for a while as the reference does at the reset."""
-    ahead = quat.rotate(quat.heading(reference.qpos[3:7]), jnp.array([1.0, 0, 0]))
-    facing = jnp.arctan2(ahead[1], ahead[0])
-    root, velocity = reference.qpos[:2], reference.qvel[:2]
-    return paths.begin(key, gaits, root, velocity, facing)
+    """A motion that goes on for a while as a planned reference does at the reset."""
+    root = reference.qpos[:2] - reference.sway
+    return paths.begin(key, gaits, root, reference.travel, facing(reference.qpos))
+
+
+def facing(qpos: Array) -> Array:
+    """The heading [] of a pose [55], rad."""
+    ahead = quat.rotate(quat.heading(qpos[3:7]), jnp.array([1.0, 0, 0]))
+    return jnp.arctan2(ahead[1], ahead[0])
 
 
 def begin(
     references: References, loops: Strides, phase: Array, speed: Array, dt: float
 ) -> RefState:
-    """The reference at a phase, over the origin, going along x at a speed in m/s."""
+    """The reference at a phase, about the origin, going along x at a speed in m/s."""
     zero = jnp.zeros(())
     now = loops.pose(references, phase, speed, zero)
     earlier = phase - dt * loops.cadence(speed)
-    before = loops.pose(references, earlier, speed, zero - dt).at[0].set(-dt * speed)
+    before = loops.pose(references, earlier, speed, zero - dt).at[0].add(-dt * speed)
     return RefState(
         qpos=now,
         qvel=rate(references.coords, before, now, dt),
@@ -152,15 +163,17 @@ def begin(
         time=zero,
         travel=jnp.stack([speed, zero]),
         phase=phase % 1.0,
+        sway=now[:2],
     )
 
 
 def go_on(
     references: References, loops: Strides, motion: Motion, at: RefState, elapsed: float
 ) -> RefState:
-    """The reference `elapsed` s later, its root on the path of a motion.
+    """The reference `elapsed` s later, its root about the path of a motion.
 
-    Its velocity is the path's over the ground, else by central differences.
+    Velocities are the path's over the ground and, by central differences, those of the
+    strides.
 
     Args:
         references: of the loops.
@@ -180,15 +193,17 @@ def go_on(
         pose = loops.pose(references, phase(later), speed, time + later)
         return planar_moved(pose, heading + later * motion.turn, position)
 
-    velocities = rate(references.coords, at.qpos, pose(elapsed), 2.0 * elapsed)
+    now = pose(0.0)
+    of_strides = rate(references.coords, pose(-elapsed), pose(elapsed), 2.0 * elapsed)
     return dataclasses.replace(
         at,
-        qpos=pose(0.0),
-        qvel=velocities.at[:2].set(velocity),
+        qpos=now,
+        qvel=of_strides.at[:2].add(velocity),
         qpos_previous=at.qpos,
         time=time,
         travel=velocity,
         phase=phase(0.0),
+        sway=now[:2] - position,
     )
 
 
@@ -210,3 +225,12 @@ def _offset(references: References, clip: int) -> float:
     left, right = (1 + names.index(name) for name in ("left_hip", "right_hip"))
     wave = np.fft.fft(np.asarray(bend[:, left] - bend[:, right]))[1]
     return float(-np.angle(wave) / (2.0 * np.pi) % 1.0)
+
+
+def _center(references: References, clip: int) -> tuple[float, float]:
+    """Where the root is on average, less the even motion of the loop's own speed, m."""
+    share = np.arange(_SAMPLES) / _SAMPLES
+    times = jnp.asarray(share * float(references.duration[clip]))
+    root = jax.vmap(lambda t: references.qpos_at(clip, t))(times)[:, :2]
+    x, y = np.mean(root - share[:, None] * np.asarray(references.shift[clip]), axis=0)
+    return float(x), float(y)

@@ -37,6 +37,7 @@ class RefState:
     time: Array  # [] s, since the start of the clip
     travel: Array  # [2] m/s, mean velocity of a loop over the ground; else zero
     phase: Array  # [] in [0, 1]
+    sway: Array  # [2] m, of the root about its path, where `motion.planner` plans one
 
 
 @struct.dataclass
@@ -100,6 +101,7 @@ class References:
             time=time,
             travel=self._travel(clip, time),
             phase=self.phase_at(clip, time),
+            sway=jnp.zeros(2),
         )
 
     def sample(

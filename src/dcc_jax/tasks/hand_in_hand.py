@@ -126,8 +126,8 @@ class HandInHand(Task):
         self, key: Array, scene: physics.Scene, reference: RefState
     ) -> tuple[HandInHandState, Array, Array]:
         """The partner goes as the reference does, its hand where the reference's is."""
-        root, before = reference.qpos[:2], reference.qpos_previous[:2]
         motion = planner.first_motion(key, self.gaits, reference)
+        before, (root, *_) = motion.position, paths.path(motion, jnp.zeros(()))
         now = paths.to_path(palm(reference.qpos), root, motion.heading)
         then = paths.to_path(palm(reference.qpos_previous), before, motion.heading)
         state = HandInHandState(
