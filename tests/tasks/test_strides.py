@@ -134,16 +134,16 @@ def test_clips_that_do_not_suit_the_task_are_refused_before_anything_is_traced(t
 
 def _going(speed: float, turn: float = 0.0) -> Motion:
     """Goes on at a speed in m/s, in a curve of so many rad/s."""
-    speed, turn, zero = jnp.array(speed), jnp.array(turn), jnp.zeros(())
+    goes, turns, zero = jnp.array(speed), jnp.array(turn), jnp.zeros(())
     return Motion(
         time=zero,
         position=jnp.zeros(2),
         heading=zero,
-        speed=speed,
+        speed=goes,
         acceleration=zero,
-        turn=turn,
-        wanted_speed=speed,
-        wanted_turn=turn,
+        turn=turns,
+        wanted_speed=goes,
+        wanted_turn=turns,
         left=zero,
     )
 
