@@ -74,7 +74,7 @@ def rows(recording: Recording, scene: physics.Scene) -> list[Row]:
     along = recording.numbers["task/speed_along"][half:]
     lead = np.asarray(_lead(jnp.asarray(recording.motion.qpos[half:]), scene))
     slip, stands = (recording.numbers[n][half:] for n in ("slip", "stands"))
-    command = np.array(SPEEDS)[
+    commanded = np.array(SPEEDS)[
         np.argmin(np.abs(wanted[-1][:, None] - np.array(SPEEDS)), axis=1)
     ]
     loops = planner.strides(
@@ -84,7 +84,7 @@ def rows(recording: Recording, scene: physics.Scene) -> list[Row]:
     )
     found = []
     for speed in SPEEDS:
-        mine = command == speed
+        mine = commanded == speed
         whole = mine & ~recording.fell & recording.alive.all(axis=0)
         steps = [_steps(lead[:, i]) for i in np.flatnonzero(whole)]
         seconds = lead.shape[0] * CONTROL_DT

@@ -6,7 +6,8 @@ Clips are steady strides of a few speeds, mostly straight ahead. Who is told to 
 speed and to turn cannot always look like one of them. So the policy stands beside a
 motion without physics: the package's loops, blended by `motion.planner` along paths of
 the same gaits. Both are measured alike, `style/nearest` by the speed of the path, at
-alpha 0 and until a fall. The last row has 95 % intervals over episodes.
+alpha 0 and until a fall. The last row has 95 % intervals over episodes, less those that
+fall in their first control step.
 """
 
 from __future__ import annotations
@@ -79,13 +80,17 @@ def planned(
         at = planner.first_reference(at_key, loops, gaits, stands=False)
         return at, planner.first_motion(motion_key, gaits, at)
 
-    def one(at: RefState, motion: Motion, key: Array) -> tuple[RefState, Motion]:
+    def one(carry: tuple[RefState, Motion], key: Array) -> tuple[RefState, Motion]:
+        at, motion = carry
         motion = paths.go_on(key, gaits, motion)
         return planner.go_on(loops, strides, motion, at, CONTROL_DT), motion
 
     def step(carry: Any, keys: Array) -> tuple[Any, tuple[Array, Array]]:
-        at, motion = carry = jax.vmap(one)(*carry, keys)
-        return carry, (jax.vmap(as_seen)(at.qpos, at.qpos_previous), motion.speed)
+        at, motion = jax.vmap(one)(carry, keys)
+        return (at, motion), (
+            jax.vmap(as_seen)(at.qpos, at.qpos_previous),
+            motion.speed,
+        )
 
     @jax.jit
     def episodes(begin: tuple[Array, Array], keys: Array) -> tuple[Array, Array]:
@@ -116,12 +121,13 @@ def rows(names: tuple[str, ...], all_seen: list[Seen], all_mm: list[np.ndarray])
     for low, high in pairwise(EDGES):
         cells = []
         for (_, speed, _), mm in zip(all_seen, all_mm, strict=True):
-            inside = mm[(np.asarray(speed) >= low) & (np.asarray(speed) < high)]
-            cells.append(f"{np.nanmean(inside):.0f}" if inside.size else "-")
+            band = (np.asarray(speed) >= low) & (np.asarray(speed) < high)
+            inside = mm[band & np.isfinite(mm)]
+            cells.append(f"{inside.mean():.0f}" if inside.size else "-")
         lines.append(f"| {low:g} to {high:g} | {' | '.join(cells)} |")
     cells = []
     for mm in all_mm:
-        of_episode = np.nanmean(mm, axis=0)
+        of_episode = np.nanmean(mm[:, np.isfinite(mm[0])], axis=0)
         mean = bootstrap.mean(of_episode, bootstrap.draws(len(of_episode)))
         cells.append(f"{mean.value:.1f} [{mean.low:.1f}, {mean.high:.1f}]")
     return "\n".join([*lines, f"| all | {' | '.join(cells)} |"])

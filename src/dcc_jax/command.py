@@ -164,7 +164,7 @@ def unforeseen(error: Exception, log: Path) -> WorkError:
 def script(main: Callable[[], None]) -> NoReturn:
     """Runs the main function of a script and ends the process with its status.
 
-    What goes wrong is one line, and the traceback lies in the file that it names.
+    An exception is one line, and its traceback lies in the file that the line names.
     """
 
     def work() -> int:

@@ -111,6 +111,20 @@ def test_what_it_begins_with_moves_as_it_says(references, loops, speed):
     np.testing.assert_allclose(state.qvel, gone, atol=2e-3)
 
 
+@pytest.mark.parametrize("speed", [0.8, 2.6])
+def test_what_it_begins_with_goes_at_its_speed_on_average(references, loops, speed):
+    begin = jax.vmap(
+        lambda p: planner.begin(references, loops, p, jnp.array(speed), CONTROL_DT)
+    )
+    begun = begin(jnp.asarray(PHASES))
+    moved = (begun.qpos - begun.qpos_previous)[:, :2] / CONTROL_DT
+    for velocity in (begun.qvel[:, :2], moved):
+        np.testing.assert_allclose(velocity.mean(axis=0), [speed, 0.0], atol=0.02)
+    np.testing.assert_allclose(
+        begun.qvel[:, :2] - begun.sway_velocity, begun.travel, atol=1e-5
+    )
+
+
 @pytest.mark.parametrize(
     ("names", "reason"),
     [

@@ -371,8 +371,12 @@ class Environment:
         )
 
     def _root_target(self, state: EnvState) -> RootTarget:
+        at = state.reference
+        if self.tracks_reference:
+            return RootTarget(at.qpos[:2], at.qvel[:2])
         if self.follows_reference:
-            return RootTarget(state.reference.qpos[:2], state.reference.qvel[:2])
+            # When to sway is its own affair.
+            return RootTarget(at.qpos[:2] - at.sway, at.qvel[:2] - at.sway_velocity)
         return self.task.root_target(self.scene, state.task, state.start, state.time)
 
     def _check(self) -> None:

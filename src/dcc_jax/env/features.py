@@ -129,7 +129,7 @@ def _quat_qpos(model: mujoco.MjModel, body: int) -> range:
     return range(start, start + 4)
 
 
-@partial(jax.jit, static_argnums=0)  # traced once, however often a program has it
+@partial(jax.jit, static_argnums=0)  # traced once for each character
 def body_poses(kinematics: Kinematics, q: Array) -> tuple[Array, Array]:
     """World positions [15, 3] in m and orientations [15, 4] of the bodies at q [55]."""
     welded = jnp.array([1.0, 0.0, 0.0, 0.0], q.dtype)

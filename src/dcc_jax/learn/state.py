@@ -247,7 +247,7 @@ def _begun(
         begun = jax.vmap(reset)(keys)
         return begun, (begun.obs, jax.vmap(environment.expert_action)(begun))
 
-    # The shapes of one reset, which has been traced; to batch it takes a while.
+    # Of one reset: it is jitted, and traced already. Tracing it batched takes a while.
     shapes = jax.eval_shape(reset, jax.ShapeDtypeStruct((), keys.dtype))
     nothing = jax.tree.map(lambda x: jnp.zeros((size, *x.shape), x.dtype), shapes)
     begun, shown = jax.lax.scan(one, nothing, keys)

@@ -62,20 +62,21 @@ def begin(
     position: Array,
     velocity: Array,
     facing: Array,
-    sway: float = SWAY,
+    slowest: float = SWAY,
 ) -> Motion:
     """A partner that goes on for a while as the reference does at the reset.
 
     Args:
         key: consumed.
         gaits: what it may do later.
-        position: of the reference's root [2], m, world.
-        velocity: of it [2], m/s. Below `sway` it stands, and will go where it faces.
+        position: of the path [2], m, world.
+        velocity: along it [2], m/s. Below `slowest` it stands, and will go where it
+            faces.
         facing: heading of the reference, rad.
-        sway: m/s.
+        slowest: m/s.
     """
     speed = length(velocity)
-    goes = speed > sway
+    goes = speed > slowest
     heading = jnp.where(goes, jnp.arctan2(velocity[1], velocity[0]), facing)
     speed = jnp.where(goes, speed, 0.0)
     zero = jnp.zeros(())

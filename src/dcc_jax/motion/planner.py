@@ -2,7 +2,8 @@
 
 The Appendix of the paper lets a planner give q_m(t). This one takes loops at a few
 speeds, a stand among them, brings their strides into phase, and blends the two whose
-speeds are next to the wanted one. All loops go along x.
+speeds are next to the wanted one. All loops go along x. The path moves evenly, and the
+root sways beside it as it does in the loops: without that, standing soles would slide.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ LOOPS = (
 )
 """Clips of the package that go together as strides."""
 STANDS = 0.05  # m/s; a loop that is slower has no strides
-_SAMPLES = 64  # of a period, to find its phase
+_SAMPLES = 64  # of a period, to find its phase and its middle
 
 
 @dataclass(frozen=True)
@@ -54,8 +55,8 @@ class Strides:
     ) -> Array:
         """qpos [55] at a phase of the stride, heading along x.
 
-        What moves evenly is over the origin: the root sways about it as in the loops,
-        or soles that stand would slide.
+        The root is where it sways to beside a point that moves evenly, which is the
+        origin.
 
         Args:
             references: of which these are the loops.
@@ -136,41 +137,40 @@ def first_reference(
 
 
 def first_motion(key: Array, gaits: Gaits, reference: RefState) -> Motion:
-    """A motion that goes on for a while as a planned reference does at the reset."""
+    """A motion that goes on for a while as the reference's path does at the reset."""
+    ahead = quat.rotate(quat.heading(reference.qpos[3:7]), jnp.array([1.0, 0, 0]))
+    facing = jnp.arctan2(ahead[1], ahead[0])
     root = reference.qpos[:2] - reference.sway
-    return paths.begin(key, gaits, root, reference.travel, facing(reference.qpos))
-
-
-def facing(qpos: Array) -> Array:
-    """The heading [] of a pose [55], rad."""
-    ahead = quat.rotate(quat.heading(qpos[3:7]), jnp.array([1.0, 0, 0]))
-    return jnp.arctan2(ahead[1], ahead[0])
+    velocity = reference.qvel[:2] - reference.sway_velocity
+    return paths.begin(key, gaits, root, velocity, facing)
 
 
 def begin(
     references: References, loops: Strides, phase: Array, speed: Array, dt: float
 ) -> RefState:
-    """The reference at a phase, about the origin, going along x at a speed in m/s."""
+    """The reference at a phase, its path at the origin, along x at a speed in m/s."""
     zero = jnp.zeros(())
     now = loops.pose(references, phase, speed, zero)
     earlier = phase - dt * loops.cadence(speed)
     before = loops.pose(references, earlier, speed, zero - dt).at[0].add(-dt * speed)
+    qvel, travel = rate(references.coords, before, now, dt), jnp.stack([speed, zero])
     return RefState(
         qpos=now,
-        qvel=rate(references.coords, before, now, dt),
+        qvel=qvel,
         qpos_previous=before,
         clip=jnp.zeros((), jnp.int32),
         time=zero,
-        travel=jnp.stack([speed, zero]),
+        travel=travel,
         phase=phase % 1.0,
         sway=now[:2],
+        sway_velocity=qvel[:2] - travel,
     )
 
 
 def go_on(
     references: References, loops: Strides, motion: Motion, at: RefState, elapsed: float
 ) -> RefState:
-    """The reference `elapsed` s later, its root about the path of a motion.
+    """The reference `elapsed` s later, its root beside the path of a motion.
 
     Velocities are the path's over the ground and, by central differences, those of the
     strides.
@@ -204,6 +204,7 @@ def go_on(
         travel=velocity,
         phase=phase(0.0),
         sway=now[:2] - position,
+        sway_velocity=of_strides[:2],
     )
 
 
@@ -217,8 +218,7 @@ def rate(coords: quat.Coordinates, before: Array, now: Array, dt: float) -> Arra
 
 def _offset(references: References, clip: int) -> float:
     """Where in its period the left hip is farthest back against the right one."""
-    times = np.arange(_SAMPLES) / _SAMPLES * float(references.duration[clip])
-    qpos = jax.vmap(lambda t: references.qpos_at(clip, t))(jnp.asarray(times))
+    qpos, _ = _sampled(references, clip)
     names = load_character().joint_names
     _, quats = references.coords.split_q(qpos)
     bend = quat.log(quats)[..., 1]
@@ -229,8 +229,14 @@ def _offset(references: References, clip: int) -> float:
 
 def _center(references: References, clip: int) -> tuple[float, float]:
     """Where the root is on average, less the even motion of the loop's own speed, m."""
+    qpos, share = _sampled(references, clip)
+    even = share[:, None] * np.asarray(references.shift[clip])
+    x, y = np.mean(np.asarray(qpos[:, :2]) - even, axis=0)
+    return float(x), float(y)
+
+
+def _sampled(references: References, clip: int) -> tuple[Array, np.ndarray]:
+    """Poses [_SAMPLES, 55] of a period, and at which shares of it they are."""
     share = np.arange(_SAMPLES) / _SAMPLES
     times = jnp.asarray(share * float(references.duration[clip]))
-    root = jax.vmap(lambda t: references.qpos_at(clip, t))(times)[:, :2]
-    x, y = np.mean(root - share[:, None] * np.asarray(references.shift[clip]), axis=0)
-    return float(x), float(y)
+    return jax.vmap(lambda t: references.qpos_at(clip, t))(times), share

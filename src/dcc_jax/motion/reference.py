@@ -37,7 +37,8 @@ class RefState:
     time: Array  # [] s, since the start of the clip
     travel: Array  # [2] m/s, mean velocity of a loop over the ground; else zero
     phase: Array  # [] in [0, 1]
-    sway: Array  # [2] m, of the root about its path, where `motion.planner` plans one
+    sway: Array  # [2] m, of the root beside its path, where there is one; else zero
+    sway_velocity: Array  # [2] m/s, the same of its velocity
 
 
 @struct.dataclass
@@ -102,6 +103,7 @@ class References:
             travel=self._travel(clip, time),
             phase=self.phase_at(clip, time),
             sway=jnp.zeros(2),
+            sway_velocity=jnp.zeros(2),
         )
 
     def sample(

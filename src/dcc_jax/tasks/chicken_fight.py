@@ -191,7 +191,7 @@ class ChickenFight(Task):
         root, travel = reference.qpos[:2], reference.travel
         # Away from the box where it begins at rest; hops do not sway.
         motion = paths.begin(
-            motion_key, self.gaits, root, travel, way + jnp.pi, sway=STILL
+            motion_key, self.gaits, root, travel, way + jnp.pi, slowest=STILL
         )
         state = ChickenFightState(
             motion=motion,

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from functools import cache
 from typing import ClassVar
 
 import flax.struct
@@ -25,7 +24,7 @@ import mujoco
 import numpy as np
 
 from dcc_jax import physics, quat
-from dcc_jax.character import BODIES, CONTROL_DT, compose_scene, load_character
+from dcc_jax.character import BODIES, CONTROL_DT, load_character
 from dcc_jax.env import features
 from dcc_jax.env.task import Forces, Task, place_character
 from dcc_jax.motion import paths, planner
@@ -37,7 +36,7 @@ Array = jax.Array
 HAND = "left_hand"
 PALM = (0.0, 0.085, 0.0)  # m, in the hand's frame
 ZERO_PALM = (0.0, 0.775, 1.335)  # m, where it is in the character's zero pose
-NOMINAL_HAND = (0.2, 0.42, 0.84)  # m ahead, left of the reference's root, and up
+NOMINAL_HAND = (0.2, 0.42, 0.84)  # m ahead, left of the path, and up
 ARM = {"left_shoulder": (-0.97, 0.24, -0.12), "left_elbow": (0.0, 0.0, -0.73)}
 """Rotation vectors, rad, that hold the left palm at NOMINAL_HAND: within 1 cm in a
 stand, 4 cm in a jog or a run in the mean, with 4 cm of rocking. Arms that swung had the
@@ -81,7 +80,7 @@ class HandInHand(Task):
     longest_gap: float = 0.15
     """Gap between the hands beyond which they have parted, m."""
     farthest: float = 1.2
-    """Distance of the root from the reference's beyond which an episode ends, m."""
+    """Distance of the root from the path beyond which an episode ends, m."""
 
     def extend(self, spec: mujoco.MjSpec) -> None:
         """The partner and the ball joint between the hands."""
@@ -245,7 +244,7 @@ class HandInHand(Task):
 
 def palm(q: Array) -> Array:
     """Where the left palm of a character with coordinates [55] is: [3] m, world."""
-    positions, quats = features.body_poses(_kinematics(), q)
+    positions, quats = features.body_poses(features.skeleton(), q)
     hand = BODIES.index(HAND)
     return positions[hand] + quat.rotate(quats[hand], jnp.array(PALM))
 
@@ -267,11 +266,6 @@ def _reaching(coords: quat.Coordinates, reference: RefState) -> RefState:
         qvel=coords.join_v(scalars, turning.at[arm].set(0.0)),
         qpos_previous=held(reference.qpos_previous),
     )
-
-
-@cache
-def _kinematics() -> features.Kinematics:
-    return features.Kinematics.of(compose_scene(load_character(), floor=False))
 
 
 def _settling(state: HandInHandState, time: Array) -> Array:

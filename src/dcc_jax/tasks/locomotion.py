@@ -69,9 +69,7 @@ class Locomotion(Task):
         self, key: Array, scene: physics.Scene, reference: RefState
     ) -> tuple[LocomotionState, Array, Array]:
         """It goes on for a while as the clip does."""
-        root, velocity = reference.qpos[:2], reference.qvel[:2]
-        facing = planner.facing(reference.qpos)
-        motion = paths.begin(key, self.gaits, root, velocity, facing)
+        motion = planner.first_motion(key, self.gaits, reference)
         return LocomotionState(motion), *place_character(scene, reference)
 
     def control_step(

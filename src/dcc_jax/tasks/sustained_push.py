@@ -68,8 +68,7 @@ class SustainedPush(Task):
     slope: float = 0.3
     """Largest angle of the force above or below the ground plane, rad."""
     leash: float = 0.8
-    """Largest distance between the root and the reference's at the start of a control
-    step, m.
+    """Largest distance between the root and its path at the start of a control step, m.
     With a path that did not wait, most episodes ended where it was lost."""
 
     def quiet(self) -> SustainedPush:

@@ -27,10 +27,11 @@ from dcc_jax.learn.rollout import Policy
 
 _FOLDER = "checkpoints"
 _DIGITS = 9  # of an update in the name of its checkpoint
-_STATE_FORMAT = 5
+_STATE_FORMAT = 6
 _POLICY_FORMAT = 3
 """Raised when their arrays come to mean something else. 3: discriminator and policy see
-velocities. 4: a state holds the averaged policy."""
+velocities. 4: a state holds the averaged policy. 5: how soles slide is seen. 6: a
+reference sways."""
 
 
 class CheckpointError(RuntimeError):

@@ -168,27 +168,26 @@ def _loop(run: Run, progress: logs.Progress, stop: StopSignal) -> TrainResult:
 def _prepared(
     run: Run, say: Callable[[str], None]
 ) -> tuple[TrainState, learner.Update]:
-    """The first state and the compiled update.
+    """The first state, and the update: compiled, where there is one left to make.
 
     A new state is compiled and made beside the update. Only this thread traces: jax
     shares what it has traced, and where two race for that, the program is another one
     at every start, which no compile cache holds.
     """
-    devices = f"{run.mesh.size} {jax.default_backend()} device(s)"
-    began = time.perf_counter()
     init = learner.make_init(run.environment, run.config, run.mesh, start=run.start)
     key = jax.random.key(run.config.seed)
-    template = jax.eval_shape(init, key, None)
     if run.resume and checkpoint.available(run.run_dir):
+        template = jax.eval_shape(init, key, None)
         state = _restored(run, template, say)
         if _all_collected(run, int(state.update)):
             return state, learner.make_update(run.environment, run.config, run.mesh)
-        say(f"compiling for {devices} ...")
+        began = _compiling(run, say)
         compiled = _lowered(run, template).compile()
     else:
         if run.resume:
             say(f"no checkpoint in {run.run_dir}: it begins with the first update")
-        say(f"compiling for {devices} ...")
+        began = _compiling(run, say)
+        template = jax.eval_shape(init, key, None)
         lowered = init.lower(key, None)  # pyright: ignore[reportFunctionMemberAccess]
         with ThreadPoolExecutor(1) as beside:
             made = beside.submit(lambda: lowered.compile()(key, None))
@@ -196,6 +195,12 @@ def _prepared(
         state = made.result()
     say(f"compiled in {time.perf_counter() - began:.1f} s")
     return state, compiled
+
+
+def _compiling(run: Run, say: Callable[[str], None]) -> float:
+    """When it began, of `time.perf_counter`."""
+    say(f"compiling for {run.mesh.size} {jax.default_backend()} device(s) ...")
+    return time.perf_counter()
 
 
 def _all_collected(run: Run, updates: int) -> bool:
