@@ -1,21 +1,19 @@
 """How near to its clips a motion is that goes where it is told, beside the planner's.
 
-    python experiments/style_by_speed.py locomotion [--episodes 64] [--seconds 10]
+    python experiments/style_by_speed.py locomotion [--episodes 64] [--alpha 0]
 
 Clips are steady strides of a few speeds, mostly straight ahead. Who is told to change
 speed and to turn cannot always look like one of them. So the policy stands beside a
 motion without physics: the package's loops, blended by `motion.planner` along paths of
-the same gaits. Both are measured alike, `style/nearest` by the speed of the path, at
-alpha 0 and until a fall. The last row has 95 % intervals over episodes, less those that
-fall in their first control step.
+the same gaits. Both are measured alike, `style/nearest` by the speed of the path and
+until a fall. The last row has 95 % intervals over episodes, less those that fall in
+their first control step.
 """
 
 from __future__ import annotations
 
-import argparse
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 from dcc_jax import command, runtime
@@ -27,6 +25,7 @@ if __name__ == "__main__":
 import jax
 import jax.numpy as jnp
 import numpy as np
+from commanded import asked
 
 from dcc_jax.character import CONTROL_DT, CONTROL_RATE, asset_path
 from dcc_jax.env import expert
@@ -37,7 +36,7 @@ from dcc_jax.motion import paths, planner
 from dcc_jax.motion.clip import load_clip
 from dcc_jax.motion.paths import Gaits, Motion
 from dcc_jax.motion.reference import References, RefState, make_references
-from dcc_jax.play.runs import Run, find_run, make_environment
+from dcc_jax.play.runs import Run, make_environment
 from dcc_jax.tasks.locomotion import Locomotion
 
 Array = jax.Array
@@ -48,7 +47,9 @@ Shape = tuple[int, int]  # control steps T, episodes N
 EDGES = (0.0, 0.05, 0.6, 1.0, 1.4, 1.8, 2.2, 2.7, 3.1)  # m/s
 
 
-def policy(run: Run, environment: Environment, shape: Shape, key: Array) -> Seen:
+def policy(
+    run: Run, environment: Environment, alpha: float, shape: Shape, key: Array
+) -> Seen:
     """What the mean action does in episodes of T control steps."""
     begin_key, step_key = jax.random.split(key)
 
@@ -60,7 +61,7 @@ def policy(run: Run, environment: Environment, shape: Shape, key: Array) -> Seen
 
     @jax.jit
     def episodes(begin: Array, keys: Array) -> Seen:
-        reset = jax.vmap(lambda key: environment.reset(key, jnp.zeros(())))
+        reset = jax.vmap(lambda key: environment.reset(key, jnp.asarray(alpha)))
         return jax.lax.scan(step, reset(begin), keys)[1]
 
     begin = jax.random.split(begin_key, shape[1])
@@ -134,24 +135,14 @@ def rows(names: tuple[str, ...], all_seen: list[Seen], all_mm: list[np.ndarray])
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    add = parser.add_argument
-    add("run", type=Path, metavar="RUN_DIR|NAME")
-    add("--episodes", type=int, default=64)
-    add("--seconds", type=float, default=10.0)
-    add("--seed", type=int, default=0)
-    options = parser.parse_args()
-    run = find_run(options.run)
-    task = run.config.task
-    if not isinstance(task, Locomotion):
-        parser.error(f"{options.run} is a policy of {task.name}")
+    options, run, task = asked(__doc__ or "", Locomotion, episodes=64)
     environment = make_environment(run)
     clips = [load_clip(asset_path(f"motions/{name}.npz")) for name in planner.LOOPS]
     loops = make_references(clips)
     shape = round(options.seconds * CONTROL_RATE), options.episodes
     ours, theirs = jax.random.split(jax.random.key(options.seed))
     seen = [
-        policy(run, environment, shape, ours),
+        policy(run, environment, options.alpha, shape, ours),
         planned(task.gaits, loops, environment, shape, theirs),
     ]
     apart = [distances(environment, x) for x in seen]
