@@ -114,11 +114,12 @@ def test_point_jacobians_and_positions_equal_c_mujoco(scene, landing):
             np.testing.assert_allclose(ours, theirs, atol=2e-6)
 
 
-def test_generalized_force_of_two_forces_equals_c_mujoco(scene, landing):
+@pytest.mark.parametrize("names", [("left_hand", "head"), ("left_hand",)])
+def test_generalized_force_equals_c_mujoco(scene, landing, names):
     c, _, _ = landing
     rng = np.random.default_rng(4)
-    bodies = np.array([scene.body("left_hand"), scene.body("head")])
-    force_w = 50.0 * rng.normal(size=(BATCH, 2, 3))
+    bodies = np.array([scene.body(name) for name in names])
+    force_w = 50.0 * rng.normal(size=(BATCH, len(names), 3))
     point_w = np.stack([data.xpos[bodies] for data in c])
     point_w += 0.1 * rng.normal(size=point_w.shape)
 
@@ -139,6 +140,38 @@ def test_generalized_force_of_two_forces_equals_c_mujoco(scene, landing):
                 scene.model, c[i], force, np.zeros(3), point, body, theirs
             )
         np.testing.assert_allclose(found, theirs, atol=1e-5 * np.abs(theirs).max())
+
+
+@pytest.mark.parametrize("turning", [False, True], ids=["slide and hinge", "ball"])
+def test_springs_and_dampers_equal_c_mujoco(character: Character, turning: bool):
+    def sprung(spec: mujoco.MjSpec) -> None:
+        body = spec.worldbody.add_body(name="pad", pos=[2, 0, 1])
+        body.add_geom(size=[0.1, 0.1, 0.1], mass=3.0, contype=0, conaffinity=0)
+        given = dict(stiffness=[300.0, 0, 0], damping=[7.0, 0, 0])
+        if turning:
+            body.add_joint(type=mujoco.mjtJoint.mjJNT_BALL, **given)
+        else:
+            slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+            body.add_joint(type=slide, axis=[0, 0, 1], springref=0.3, **given)
+            body.add_joint(type=hinge, axis=[0, 1, 0], **given)
+
+    model = compose_scene(character, floor=False, extend=sprung)
+    scene = physics.make_scene(model, character)
+    rng, data = np.random.default_rng(5), mujoco.MjData(scene.model)
+    turned = 0.4 * rng.normal(size=model.nv)
+    mujoco.mj_integratePos(scene.model, data.qpos, turned, 1.0)
+    data.qvel[:] = rng.normal(size=model.nv)
+    mujoco.mj_forward(scene.model, data)
+    assert np.abs(data.qfrc_passive[42:]).min() > 1.0
+    qpos, qvel = (jnp.asarray(x, jnp.float32) for x in (data.qpos, data.qvel))
+
+    @jax.jit
+    def ours(state: physics.State) -> jax.Array:
+        kin = physics.kinematics(scene, state)
+        return physics.solve(scene, kin, state, jnp.zeros(model.nv)).qacc
+
+    pad = ours(physics.initial_state(scene, qpos, qvel))[42:]
+    np.testing.assert_allclose(pad, data.qacc[42:], rtol=1e-4, atol=1e-3)
 
 
 def test_stable_pd_is_the_explicit_equation(character: Character):

@@ -202,13 +202,18 @@ class Coordinates:
         return _entries(flat, np.argsort(order))
 
 
+_MAX_RUNS = 8
+
+
 def _entries(x: Array, indices: np.ndarray) -> Array:
-    """x[..., indices], as a slice where they follow one another: XLA gathers slowly."""
+    """x[..., indices], as slices of what follows one another: XLA gathers slowly."""
     flat = indices.ravel()
-    if len(flat) and np.all(np.diff(flat) == 1):
-        part = x[..., flat[0] : flat[-1] + 1]
-        return part.reshape(*x.shape[:-1], *indices.shape)
-    return x[..., indices]
+    runs = np.split(flat, np.flatnonzero(np.diff(flat) != 1) + 1) if len(flat) else []
+    parts = [x[..., run[0] : run[-1] + 1] for run in runs]
+    if not 1 <= len(parts) <= _MAX_RUNS:
+        return x[..., indices]
+    part = parts[0] if len(parts) == 1 else jnp.concatenate(parts, axis=-1)
+    return part.reshape(*x.shape[:-1], *indices.shape)
 
 
 def identity(coords: Coordinates) -> Array:

@@ -20,6 +20,7 @@ from __future__ import annotations
 import flax.struct
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from dcc_jax import quat
@@ -29,6 +30,7 @@ from dcc_jax.physics.quiet_mjx import mjx
 from dcc_jax.physics.scene import Scene
 
 Array = jax.Array
+_FREE, _BALL = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
 
 
 @flax.struct.dataclass
@@ -137,8 +139,7 @@ def solve(scene: Scene, kin: Kinematics, state: State, qfrc: Array) -> Solution:
         qfrc: applied generalized forces [nv], N and N m.
     """
     model, data = scene.mjx_model, kin.data
-    data = mjx.passive(model, data)
-    smooth = qfrc + data.qfrc_passive - data.qfrc_bias
+    smooth = qfrc + _passive(scene, data) - data.qfrc_bias
     if _native(scene, state):
         given = newton_kernel.problem(model, data, smooth, state.qacc)
         qacc, force = newton_kernel.newton(
@@ -165,13 +166,35 @@ def solve(scene: Scene, kin: Kinematics, state: State, qfrc: Array) -> Solution:
     )
 
 
+def _passive(scene: Scene, data: mjx.Data) -> Array:
+    """Forces [nv] of dampers, and of the springs of slides and hinges.
+
+    MJX has all else that is passive, but takes logarithms of joints without a spring.
+    """
+    model, dtype = scene.model, data.qvel.dtype
+    sprung = np.flatnonzero(model.jnt_stiffness)
+    turning = np.isin(model.jnt_type[sprung], (_FREE, _BALL)).any()
+    fluid = scene.mjx_model.opt._impl.has_fluid_params
+    if turning or fluid or model.ntendon or model.body_gravcomp.any():
+        return mjx.passive(scene.mjx_model, data).qfrc_passive
+    force = -jnp.asarray(model.dof_damping, dtype) * data.qvel
+    if len(sprung):
+        at = model.jnt_qposadr[sprung]
+        stretch = data.qpos[at] - jnp.asarray(model.qpos_spring[at], dtype)
+        pull = jnp.asarray(model.jnt_stiffness[sprung], dtype) * stretch
+        force = force.at[model.jnt_dofadr[sprung]].add(-pull)
+    return force
+
+
 def _contact_forces(data: mjx.Data, force: Array) -> tuple[Array, Array]:
     """World forces [C, 3] and points [C, 3] from pyramid edge forces.
 
-    The pyramid of a condim-3 contact has four edges: normal +- mu tangent.
+    The pyramid of a condim-3 contact has four edges: normal +- mu tangent. Their rows
+    are the last ones.
     """
     contact = data._impl.contact
-    edges = force[contact.efc_address[:, None] + np.arange(4)]
+    count = contact.pos.shape[0]
+    edges = force[force.shape[0] - 4 * count :].reshape(count, 4)
     friction = contact.friction[:, :2]
     tangents = friction * (edges[:, 0::2] - edges[:, 1::2])
     local = jnp.concatenate([edges.sum(-1, keepdims=True), tangents], axis=-1)
@@ -213,6 +236,9 @@ def generalized_force(
     center_w = data.subtree_com[jnp.asarray(scene.mjx_model.body_rootid)[body]]
     wrench = jnp.concatenate([jnp.cross(point_w - center_w, force_w), force_w], axis=-1)
     moved = jnp.asarray(scene.moves)[body].astype(wrench.dtype)
+    if len(wrench) == 1:
+        # As a product of matrices XLA would make the wrench anew for every entry.
+        return jnp.sum((wrench @ data.cdof.T) * moved, axis=0)
     return jnp.sum((moved.T @ wrench) * data.cdof, axis=-1)
 
 
