@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -49,6 +51,10 @@ DEVICE = mjx.put_model(MODEL)
 TEMPLATE = mjx.make_data(DEVICE)
 CONTACTS = scenes._contacts(DEVICE, TEMPLATE)
 TREE = Tree.of(MODEL, CONTACTS)
+# Poses of geoms are for MJX, where it collides.
+WHOLE = replace(
+    TREE, shapes={name: (getattr(MODEL, n), *each) for name, n, each in FIELDS}
+)
 STAGES = mjx.kinematics, mjx.com_pos, mjx.crb, mjx.com_vel, mjx.rne, mjx.collision
 
 
@@ -68,7 +74,7 @@ def given_data(qpos, qvel, mocap_pos, mocap_quat) -> mjx.Data:
 
 
 def kernel(*state) -> dict[str, jax.Array]:
-    return parts(kinematics_kernel.kinematics(TREE, given_data(*state)))
+    return parts(kinematics_kernel.kinematics(WHOLE, given_data(*state)))
 
 
 def in_mjx(*state) -> dict[str, jax.Array]:
@@ -95,6 +101,12 @@ def test_everything_but_contacts_is_what_mjx_computes(both):
     for name in ours.keys() - {name for name, _ in CONTACT_FIELDS}:
         scale = np.abs(theirs[name]).max()
         np.testing.assert_allclose(ours[name], theirs[name], atol=3e-6 * scale)
+
+
+def test_poses_of_geoms_are_left_out_where_the_kernel_collides():
+    assert WHOLE.shapes.keys() - TREE.shapes.keys() == {"geom_xpos", "geom_xmat"}
+    data = jax.eval_shape(lambda: kinematics_kernel.kinematics(TREE, TEMPLATE))
+    assert data.geom_xpos.shape == (MODEL.ngeom, 3)
 
 
 def test_the_fields_are_c_mujocos(states):

@@ -57,7 +57,9 @@ class Tree:
 
     structure: np.ndarray  # [n] int32
     numbers: np.ndarray  # [m] float32, lengths in m, masses in kg
-    shapes: dict[str, tuple[int, ...]]  # of what the kernel fills in
+    shapes: dict[
+        str, tuple[int, ...]
+    ]  # of what the kernel fills in: geoms for MJX only
     contacts: mjx.Contact  # what is static of the scene's
     collides: bool  # whether the kernel knows every pair of geoms that may touch
 
@@ -91,7 +93,11 @@ class Tree:
         return cls(
             structure=np.array(structure, np.int32),
             numbers=np.concatenate(numbers).astype(np.float32),
-            shapes={name: (getattr(model, n), *each) for name, n, each in FIELDS},
+            shapes={
+                name: (getattr(model, n), *each)
+                for name, n, each in FIELDS
+                if pairs is None or n != "ngeom"
+            },
             contacts=contacts,
             collides=pairs is not None,
         )
@@ -125,7 +131,8 @@ def kinematics(tree: Tree, data: mjx.Data) -> mjx.Data:
         data: with qpos, qvel and the poses of mocap bodies, single precision.
     """
     contacts = len(tree.contacts.geom) if tree.collides else 0
-    shapes = [*tree.shapes.values(), *((contacts, *each) for _, each in CONTACT_FIELDS)]
+    shapes = [tree.shapes.get(name, (0, *each)) for name, _, each in FIELDS]
+    shapes += [(contacts, *each) for _, each in CONTACT_FIELDS]
     call = jax.ffi.ffi_call(
         "dcc_kinematics",
         [jax.ShapeDtypeStruct(shape, np.float32) for shape in shapes],
@@ -139,7 +146,9 @@ def kinematics(tree: Tree, data: mjx.Data) -> mjx.Data:
         structure=tree.structure,
         numbers=tree.numbers,
     )
-    filled = dict(zip(tree.shapes, made[: len(FIELDS)], strict=True))
+    names = [name for name, _, _ in FIELDS]
+    filled = dict(zip(names, made[: len(FIELDS)], strict=True))
+    filled = {name: filled[name] for name in tree.shapes}
     if tree.collides:
         names = [name for name, _ in CONTACT_FIELDS]
         found = dict(zip(names, made[len(FIELDS) :], strict=True))

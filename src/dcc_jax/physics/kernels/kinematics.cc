@@ -68,7 +68,7 @@ V4 about(const float* axis, V angle) {
   return out;
 }
 
-// Where values come from and go to: one row an environment.
+// Where values come from and go to: one row an environment. Null: nobody wants them.
 struct Given {
   const float *qpos, *qvel, *mocap_pos, *mocap_quat;
 };
@@ -90,10 +90,11 @@ class Block {
   int nq, nv;
 
  private:
-  void place(int b, const Given& given, const int* env);
+  void load(const Given& given, const int* env);
+  void place(int b);
   void move_axes(int b);
   void feel_inertia(int b);
-  void resist(const Given& given, const int* env);
+  void resist();
   void attach(const std::vector<Attached>& all, std::vector<V3>& at,
               std::vector<V9>& turned) const;
   void touch();
@@ -108,7 +109,7 @@ class Block {
   std::vector<V9> frame, mat, geom_mat, site_mat;
   std::vector<V10> inertia, composite;
   std::vector<V6> motion, velocity, acceleration, force;
-  std::vector<V> dist, bias;
+  std::vector<V> qpos, qvel, mocap_pos, mocap_quat, dist, bias;
 };
 
 struct Reader {
@@ -178,19 +179,34 @@ Block::Block(ffi::Span<const int32_t> structure, ffi::Span<const float> numbers)
   mat.resize(bodies.size());
   for (auto* of_dof : {&anchor, &axis}) of_dof->resize(nv);  // of a joint's first
   motion.resize(nv);
-  bias.resize(nv);
+  bias.resize(nv), qvel.resize(nv), qpos.resize(nq);
+  mocap_pos.resize(3 * num_mocap), mocap_quat.resize(4 * num_mocap);
   geom_pos.resize(geoms.size()), geom_mat.resize(geoms.size());
   site_pos.resize(sites.size()), site_mat.resize(sites.size());
 }
 
+void Block::load(const Given& given, const int* env) {
+  ::load(given.qpos, nq, env, qpos.data());
+  ::load(given.qvel, nv, env, qvel.data());
+  ::load(given.mocap_pos, 3 * num_mocap, env, mocap_pos.data());
+  ::load(given.mocap_quat, 4 * num_mocap, env, mocap_quat.data());
+}
+
+template <int N>
+std::array<V, N> some(const std::vector<V>& of, int first) {
+  std::array<V, N> out;
+  std::copy_n(of.begin() + first, N, out.begin());
+  return out;
+}
+
 // Position and rotation of a body, anchors and axes of its joints.
-void Block::place(int b, const Given& given, const int* env) {
+void Block::place(int b) {
   const Body& body = bodies[b];
   V3 at{};
   V4 turn{all(1.0f), V{}, V{}, V{}};
   if (body.mocap >= 0) {
-    at = gather<3>(given.mocap_pos + 3 * body.mocap, 3 * num_mocap, env);
-    turn = unit(gather<4>(given.mocap_quat + 4 * body.mocap, 4 * num_mocap, env));
+    at = some<3>(mocap_pos, 3 * body.mocap);
+    turn = unit(some<4>(mocap_quat, 4 * body.mocap));
   } else if (b) {
     at = pos[body.parent] + rotate(mat[body.parent], body.pose.pos);
     turn = quat[body.parent];
@@ -200,22 +216,21 @@ void Block::place(int b, const Given& given, const int* env) {
   to_matrix(turn, frame);
   for (const Joint& joint : body.joints) {
     if (joint.type == kFree) {
-      at = gather<3>(given.qpos + joint.qpos, nq, env);
-      turn = unit(gather<4>(given.qpos + joint.qpos + 3, nq, env));
+      at = some<3>(qpos, joint.qpos);
+      turn = unit(some<4>(qpos, joint.qpos + 3));
       to_matrix(turn, frame);
       anchor[joint.dof] = at;
       continue;
     }
     anchor[joint.dof] = at + rotate(frame, joint.pos);
     axis[joint.dof] = rotate(frame, joint.axis);
-    const V first = gather(given.qpos + joint.qpos, nq, env) - joint.zero;
+    const V first = qpos[joint.qpos] - joint.zero;
     if (joint.type == kSlide) {
       for (int k = 0; k < 3; ++k) at[k] += axis[joint.dof][k] * first;
       continue;
     }
-    const V4 by = joint.type == kHinge
-                      ? about(joint.axis, first)
-                      : unit(gather<4>(given.qpos + joint.qpos, nq, env));
+    const V4 by = joint.type == kHinge ? about(joint.axis, first)
+                                       : unit(some<4>(qpos, joint.qpos));
     turn = times_quat(turn, by.data());
     to_matrix(turn, frame);
     at = anchor[joint.dof] - rotate(frame, joint.pos);
@@ -269,7 +284,7 @@ void Block::move_axes(int b) {
 }
 
 // Forces of gravity, Coriolis and centrifugal accelerations: recursive Newton-Euler.
-void Block::resist(const Given& given, const int* env) {
+void Block::resist() {
   velocity[0] = {};
   acceleration[0] = {V{}, V{}, V{}, all(-gravity[0]), all(-gravity[1]), all(-gravity[2])};
   for (size_t b = 1; b < bodies.size(); ++b) {
@@ -277,8 +292,7 @@ void Block::resist(const Given& given, const int* env) {
     const auto faster = [&](int first, int count) {
       V6 sum{};
       for (int dof = first; dof < first + count; ++dof) {
-        const V speed = gather(given.qvel + dof, nv, env);
-        for (int k = 0; k < 6; ++k) sum[k] += motion[dof][k] * speed;
+        for (int k = 0; k < 6; ++k) sum[k] += motion[dof][k] * qvel[dof];
       }
       return sum;
     };
@@ -300,8 +314,8 @@ void Block::resist(const Given& given, const int* env) {
     }
     velocity[b] = v, acceleration[b] = a;
     V6 momentum;
-    times_inertia(inertia[b], a.data(), force[b].data());
-    times_inertia(inertia[b], v.data(), momentum.data());
+    times_inertia(inertia[b].data(), a.data(), force[b].data());
+    times_inertia(inertia[b].data(), v.data(), momentum.data());
     const V3 turned = cross(&v[0], &momentum[0]), swept = cross(&v[3], &momentum[3]),
              carried = cross(&v[0], &momentum[3]);
     for (int k = 0; k < 3; ++k) {
@@ -321,9 +335,10 @@ void Block::resist(const Given& given, const int* env) {
 }
 
 void Block::compute(const Given& given, const int* env) {
+  load(given, env);
   const int count = bodies.size();
   for (int b = 0; b < count; ++b) {
-    place(b, given, env);
+    place(b);
     for (int k = 0; k < 3; ++k) tree_center[b][k] = center[b][k] * bodies[b].mass;
   }
   for (int b = count - 1; b >= 0; --b) {
@@ -342,7 +357,7 @@ void Block::compute(const Given& given, const int* env) {
     for (int k = 0; k < 10; ++k) composite[bodies[b].parent][k] += composite[b][k];
   composite[0] = {};
   force[0] = {};
-  resist(given, env);
+  resist();
   attach(geoms, geom_pos, geom_mat);
   attach(sites, site_pos, site_mat);
   touch();
@@ -381,16 +396,12 @@ void Block::touch() {
   }
 }
 
-template <typename T>
-void store(const std::vector<T>& from, float* to, const int* env, int count) {
-  const int64_t size = from.size() * sizeof(T) / sizeof(V);
-  const float* lanes = reinterpret_cast<const float*>(from.data());
-  for (int l = 0; l < count; ++l)
-    for (int64_t i = 0; i < size; ++i) to[env[l] * size + i] = lanes[i * kLanes + l];
-}
-
 void Block::store(const Made& made, const int* env, int count) const {
-  const auto put = [&](const auto& from, float* to) { ::store(from, to, env, count); };
+  const auto put = [&](const auto& from, float* to) {
+    if (!to) return;
+    const int64_t size = from.size() * sizeof(from[0]) / sizeof(V);
+    ::store(reinterpret_cast<const V*>(from.data()), size, env, count, to);
+  };
   put(pos, made.pos);
   put(quat, made.quat);
   put(mat, made.mat);
@@ -420,14 +431,13 @@ ffi::Error Kinematics(Floats qpos, Floats qvel, Floats mocap_pos, Floats mocap_q
                       ffi::Span<const float> numbers) {
   const Given given{qpos.typed_data(), qvel.typed_data(), mocap_pos.typed_data(),
                     mocap_quat.typed_data()};
-  const Made made{pos->typed_data(),         quat->typed_data(),
-                  mat->typed_data(),         center->typed_data(),
-                  geom_pos->typed_data(),    geom_mat->typed_data(),
-                  site_pos->typed_data(),    site_mat->typed_data(),
-                  tree_center->typed_data(), motion->typed_data(),
-                  inertia->typed_data(),     bias->typed_data(),
-                  dist->typed_data(),        point->typed_data(),
-                  frame->typed_data()};
+  const auto to = [](Result& made) {
+    return made->element_count() ? made->typed_data() : nullptr;
+  };
+  const Made made{to(pos),      to(quat),     to(mat),         to(center), to(geom_pos),
+                  to(geom_mat), to(site_pos), to(site_mat),    to(tree_center),
+                  to(motion),   to(inertia),  to(bias),        to(dist),   to(point),
+                  to(frame)};
   Block block(structure, numbers);
   for_each_block(qpos.element_count() / block.nq, [&](const int* env, int count) {
     block.compute(given, env);

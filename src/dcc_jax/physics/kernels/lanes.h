@@ -6,6 +6,8 @@
 #include <array>
 #include <cmath>
 #include <cstdint>
+#include <cstring>
+#include <utility>
 #include <vector>
 
 // As many as a vector register holds: wider vectors would be taken apart in memory.
@@ -58,11 +60,70 @@ inline V gather(const float* from, int64_t stride, const int* env) {
   return out;
 }
 
-template <int N>
-inline std::array<V, N> gather(const float* from, int64_t stride, const int* env) {
-  std::array<V, N> out;
-  for (int i = 0; i < N; ++i) out[i] = gather(from + i, stride, env);
-  return out;
+// Numbers that lie side by side, anywhere in memory.
+typedef float Row __attribute__((vector_size(4 * kLanes), aligned(4), may_alias));
+
+inline Row& row(float* at) { return *reinterpret_cast<Row*>(at); }
+inline const Row& row(const float* at) { return *reinterpret_cast<const Row*>(at); }
+
+// Of two rows of blocks of kStep numbers, the odd blocks of the first and the even ones
+// of the second change places.
+template <int kStep, int... L>
+[[gnu::always_inline]] inline void swap_blocks(Row& a, Row& b,
+                                               std::integer_sequence<int, L...>) {
+#if defined(__clang__)
+  const Row even = __builtin_shufflevector(a, b, (L & kStep ? kLanes + L - kStep : L)...);
+  const Row odd = __builtin_shufflevector(a, b, (L & kStep ? kLanes + L : L + kStep)...);
+#else
+  const Row even = __builtin_shuffle(a, b, I{(L & kStep ? kLanes + L - kStep : L)...});
+  const Row odd = __builtin_shuffle(a, b, I{(L & kStep ? kLanes + L : L + kStep)...});
+#endif
+  a = even, b = odd;
+}
+
+// A square of numbers, in place: taken one by one they would cost more than all that the
+// kernels calculate.
+template <int kStep = kLanes / 2>
+[[gnu::always_inline]] inline void transpose(Row* square) {
+  for (int i = 0; i < kLanes; ++i)
+    if (!(i & kStep))
+      swap_blocks<kStep>(square[i], square[i + kStep],
+                         std::make_integer_sequence<int, kLanes>{});
+  if constexpr (kStep > 1) transpose<kStep / 2>(square);
+}
+
+// The `size` numbers of each environment, which lie side by side in memory, a square of
+// them at a time; the last square may overlap the one before.
+inline void load(const float* from, int64_t size, const int* env, V* to) {
+  if (size < kLanes) {
+    for (int64_t i = 0; i < size; ++i) to[i] = gather(from + i, size, env);
+    return;
+  }
+  float* lanes = reinterpret_cast<float*>(to);
+  for (int64_t i = 0; i < size; i += kLanes) {
+    const int64_t first = std::min(i, size - kLanes);
+    Row square[kLanes];
+    for (int l = 0; l < kLanes; ++l) square[l] = row(from + size * env[l] + first);
+    transpose(square);
+    for (int l = 0; l < kLanes; ++l) row(lanes + (first + l) * kLanes) = square[l];
+  }
+}
+
+// The inverse, of the first `count` environments.
+inline void store(const V* from, int64_t size, const int* env, int count, float* to) {
+  if (size < kLanes) {
+    for (int l = 0; l < count; ++l)
+      for (int64_t i = 0; i < size; ++i) to[size * env[l] + i] = from[i][l];
+    return;
+  }
+  const float* lanes = reinterpret_cast<const float*>(from);
+  for (int64_t i = 0; i < size; i += kLanes) {
+    const int64_t first = std::min(i, size - kLanes);
+    Row square[kLanes];
+    for (int l = 0; l < kLanes; ++l) square[l] = row(lanes + (first + l) * kLanes);
+    transpose(square);
+    for (int l = 0; l < count; ++l) row(to + size * env[l] + first) = square[l];
+  }
 }
 
 inline V3 cross(const V* a, const V* b) {
@@ -70,9 +131,8 @@ inline V3 cross(const V* a, const V* b) {
           a[0] * b[1] - a[1] * b[0]};
 }
 
-// The momentum of a body with a spatial inertia that moves along m.
-inline void times_inertia(const V10& inertia, const V* m, V* out) {
-  const V10& a = inertia;
+// The momentum of a body with a spatial inertia a [10] that moves along m [6].
+inline void times_inertia(const V* a, const V* m, V* out) {
   const V3 tilt = cross(&a[6], m + 3), lift = cross(&a[6], m);
   out[0] = a[0] * m[0] + a[3] * m[1] + a[4] * m[2] + tilt[0];
   out[1] = a[3] * m[0] + a[1] * m[1] + a[5] * m[2] + tilt[1];

@@ -70,6 +70,7 @@ struct Block {
   std::vector<int> rows;                // that may act in any of them
   std::vector<int8_t> sign;             // [C * nv] how a dof moves a contact apart
   std::vector<V> motion, momentum;      // [nv * 6]
+  std::vector<V> inertia, center, given_J, frame, point;  // as of `Given`
   std::vector<V> D, aref, depth, residual, slope, weight;
   std::vector<V> velocity, smooth, x, mass_x, search, mass_search, y;
 
@@ -81,9 +82,9 @@ struct Block {
  private:
   int num_contacts() const { return (num_rows - num_given) / 4; }
   bool moves(int dof, int last) const;
-  void load_masses(const Given& given, const int* env);
-  void load_rows(const Given& given, const int* env);
-  void load_contact(Part& part, int r, const Given& given, const int* env);
+  void make_masses();
+  void make_rows(const Given& given, const int* env);
+  void make_contact(Part& part, int r);
   void times_mass(const std::vector<V>& in, std::vector<V>& out) const;
   void times_rows(const std::vector<V>& in, std::vector<V>& out) const;
   I active(int row, V residual) const;
@@ -127,6 +128,9 @@ Block::Block(ffi::Span<const int32_t> packed, ffi::Span<const float> numbers,
     parts.push_back(std::move(part));
   }
   for (auto* v : {&motion, &momentum}) v->resize(nv * 6);
+  inertia.resize(10 * num_bodies), center.resize(3 * num_bodies);
+  given_J.resize(num_given * nv);
+  frame.resize(9 * num_contacts()), point.resize(3 * num_contacts());
   for (auto* v : {&D, &aref, &residual, &slope, &weight}) v->resize(num_rows);
   for (auto* v : {&velocity, &smooth, &x, &mass_x, &search, &mass_search, &y})
     v->resize(nv);
@@ -139,25 +143,27 @@ bool Block::moves(int dof, int last) const {
 }
 
 void Block::load(const Given& given, const int* env) {
-  for (int i = 0; i < nv; ++i) {
-    velocity[i] = gather(given.velocity + i, nv, env);
-    smooth[i] = gather(given.smooth + i, nv, env);
-    x[i] = gather(given.start + i, nv, env);
-  }
-  load_masses(given, env);
-  load_rows(given, env);
+  const auto get = [&](const float* from, std::vector<V>& to) {
+    ::load(from, to.size(), env, to.data());
+  };
+  get(given.velocity, velocity);
+  get(given.smooth, smooth);
+  get(given.start, x);
+  get(given.motion, motion);
+  get(given.inertia, inertia);
+  get(given.center, center);
+  get(given.J, given_J);
+  get(given.dist, depth);
+  get(given.frame, frame);
+  get(given.point, point);
+  make_masses();
+  make_rows(given, env);
 }
 
 // M_ij = momentum of i's composite body along i, times the motion of its ancestor j.
-void Block::load_masses(const Given& given, const int* env) {
-  V10 inertia;
-  for (int i = 0; i < nv; ++i) {
-    for (int k = 0; k < 6; ++k)
-      motion[6 * i + k] = gather(given.motion + 6 * i + k, 6 * nv, env);
-    if (!i || body[i] != body[i - 1])
-      inertia = gather<10>(given.inertia + 10 * body[i], 10 * num_bodies, env);
-    times_inertia(inertia, &motion[6 * i], &momentum[6 * i]);
-  }
+void Block::make_masses() {
+  for (int i = 0; i < nv; ++i)
+    times_inertia(&inertia[10 * body[i]], &motion[6 * i], &momentum[6 * i]);
   for (Part& part : parts) {
     const int size = part.size();
     for (int i = 0; i < size; ++i) {
@@ -190,10 +196,10 @@ V impeded(const Constants& k, V depth) {
   return choose(x > 1.0f, all(k.high), between);
 }
 
-void Block::load_rows(const Given& given, const int* env) {
-  for (int r = 0; r < num_given; ++r) D[r] = gather(given.D + r, num_given, env);
+void Block::make_rows(const Given& given, const int* env) {
+  ::load(given.D, num_given, env, D.data());
   for (int c = 0; c < num_contacts(); ++c) {
-    depth[c] = gather(given.dist + c, num_contacts(), env) - constants[c].margin;
+    depth[c] -= constants[c].margin;
     touching[c] = any(depth[c] < 0.0f);
   }
   rows.clear();
@@ -207,17 +213,16 @@ void Block::load_rows(const Given& given, const int* env) {
       if (row >= num_given) {
         const int c = (row - num_given) / 4;
         if (!touching[c]) continue;
-        if ((row - num_given) % 4 == 0) load_contact(part, r, given, env);
+        if ((row - num_given) % 4 == 0) make_contact(part, r);
       } else {
         for (int i = 0; i < size; ++i)
-          part.J[r * size + i] = gather(given.J + int64_t(row) * nv + part.dofs[i],
-                                        int64_t(num_given) * nv, env);
+          part.J[r * size + i] = given_J[row * nv + part.dofs[i]];
       }
       part.live.push_back(r);
     }
   }
   times_rows(velocity, aref);
-  for (int r = 0; r < num_given; ++r) aref[r] = gather(given.aref + r, num_given, env);
+  ::load(given.aref, num_given, env, aref.data());
   for (int c = 0; c < num_contacts(); ++c) {
     if (!touching[c]) continue;
     const Constants& k = constants[c];
@@ -232,12 +237,10 @@ void Block::load_rows(const Given& given, const int* env) {
 }
 
 // The four edges of a contact's pyramid, normal +- friction * tangent: rows r to r + 3.
-void Block::load_contact(Part& part, int r, const Given& given, const int* env) {
+void Block::make_contact(Part& part, int r) {
   const int c = (part.rows[r] - num_given) / 4, size = part.size();
-  const int64_t count = num_contacts();
-  auto frame = gather<9>(given.frame + 9 * c, 9 * count, env);
-  for (V& x : frame) x = choose(depth[c] < 0.0f, x, V{});
-  const auto point = gather<3>(given.point + 3 * c, 3 * count, env);
+  V9 axes;
+  for (int k = 0; k < 9; ++k) axes[k] = choose(depth[c] < 0.0f, frame[9 * c + k], V{});
   const float* friction = constants[c].friction;
   V* J = &part.J[r * size];
   V3 offset;
@@ -247,16 +250,15 @@ void Block::load_contact(Part& part, int r, const Given& given, const int* env) 
     const int apart = sign[c * nv + dof];
     if (apart && root[dof] != about) {
       about = root[dof];
-      const auto center = gather<3>(given.center + 3 * about, 3 * num_bodies, env);
-      for (int k = 0; k < 3; ++k) offset[k] = point[k] - center[k];
+      for (int k = 0; k < 3; ++k) offset[k] = point[3 * c + k] - center[3 * about + k];
     }
     V3 edge{};  // how the dof moves along normal and tangents
     if (apart) {
       auto speed = cross(&motion[6 * dof], offset.data());
       for (int k = 0; k < 3; ++k) speed[k] += motion[6 * dof + 3 + k];
       for (int k = 0; k < 3; ++k)
-        edge[k] = float(apart) * (frame[3 * k] * speed[0] + frame[3 * k + 1] * speed[1] +
-                                  frame[3 * k + 2] * speed[2]);
+        edge[k] = float(apart) * (axes[3 * k] * speed[0] + axes[3 * k + 1] * speed[1] +
+                                  axes[3 * k + 2] * speed[2]);
     }
     for (int t = 0; t < 2; ++t) {
       J[2 * t * size + i] = edge[0] + friction[t] * edge[1 + t];
@@ -411,16 +413,13 @@ void Block::solve(const int* env, int count, float* qacc, float* force) {
     // Written so that what is not a number is done as well.
     done |= same & ~(off > kFullStep);
   }
-  for (int l = 0; l < count; ++l) {
-    for (int i = 0; i < nv; ++i) qacc[int64_t(env[l]) * nv + i] = x[i][l];
-    float* of_rows = force + int64_t(env[l]) * num_rows;
-    std::fill(of_rows, of_rows + num_rows, 0.0f);
-    for (int r : rows) {
-      const float at = residual[r][l];
-      const bool acts = r < num_equality || at < 0.0f;
-      of_rows[r] = acts ? -D[r][l] * at : 0.0f * at;
-    }
+  store(x.data(), nv, env, count, qacc);
+  std::fill(slope.begin(), slope.end(), V{});  // from here on the forces
+  for (int r : rows) {
+    const V at = residual[r];
+    slope[r] = choose(active(r, at), -D[r] * at, 0.0f * at);
   }
+  store(slope.data(), num_rows, env, count, force);
 }
 
 using Floats = ffi::Buffer<ffi::F32>;
