@@ -438,7 +438,7 @@ ffi::Error Kinematics(Floats qpos, Floats qvel, Floats mocap_pos, Floats mocap_q
                   to(geom_mat), to(site_pos), to(site_mat),    to(tree_center),
                   to(motion),   to(inertia),  to(bias),        to(dist),   to(point),
                   to(frame)};
-  Block block(structure, numbers);
+  Block& block = kept<Block>(structure, numbers);
   for_each_block(qpos.element_count() / block.nq, [&](const int* env, int count) {
     block.compute(given, env);
     block.store(made, env, count);

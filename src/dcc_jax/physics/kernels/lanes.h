@@ -6,7 +6,7 @@
 #include <array>
 #include <cmath>
 #include <cstdint>
-#include <cstring>
+#include <memory>
 #include <utility>
 #include <vector>
 
@@ -38,6 +38,24 @@ inline V square_root(V x) {
   V out;
   for (int l = 0; l < kLanes; ++l) out[l] = std::sqrt(x[l]);
   return out;
+}
+
+// This thread's object of what is static of a scene: made once, for as long as it is asked
+// for the same scene. It keeps room, but nothing that the next call reads.
+template <typename Made, typename Structure, typename Numbers>
+Made& kept(const Structure& structure, const Numbers& numbers) {
+  thread_local std::vector<int32_t> whole;
+  thread_local std::vector<float> real;
+  thread_local std::unique_ptr<Made> made;
+  const auto same = [](const auto& a, const auto& b) {
+    return std::equal(a.begin(), a.end(), b.begin(), b.end());
+  };
+  if (!made || !same(whole, structure) || !same(real, numbers)) {
+    whole.assign(structure.begin(), structure.end());
+    real.assign(numbers.begin(), numbers.end());
+    made = std::make_unique<Made>(structure, numbers);
+  }
+  return *made;
 }
 
 // Calls with the environments of every block, and how many they are: a last block that is

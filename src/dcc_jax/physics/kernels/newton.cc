@@ -24,14 +24,20 @@ constexpr int kLineSearchIterations = 4;
 constexpr float kFullStep = 1e-3f;
 constexpr float kTiny = 1e-15f;
 
+struct Entry {
+  int at, high, low;  // in `mass`; the degrees of freedom, the farther from the root first
+};
+
 // A limb, or the core: its own unknowns, then those of the core that it is coupled with.
 struct Part {
   int own;                     // how many of `dofs` are its own
   std::vector<int> dofs;       // of the scene
   std::vector<int> rows;       // constraint rows that touch it
-  std::vector<int> live;       // places among them of those that may act
+  std::vector<int> live;       // places among them of those that may act; of a contact's
+                               // four the first
   std::vector<int> in_core;    // where the coupled ones are among the core's
   std::vector<V> mass, front;  // lower triangles [i * size + j]
+  std::vector<Entry> entries;  // of `mass` that are not zero
   std::vector<V> J;            // [row * size + i]
 
   int size() const { return static_cast<int>(dofs.size()); }
@@ -72,10 +78,9 @@ struct Block {
   std::vector<V> motion, momentum;      // [nv * 6]
   std::vector<V> inertia, center, given_J, frame, point;  // as of `Given`
   std::vector<V> D, aref, depth, residual, slope, weight;
-  std::vector<V> velocity, smooth, x, mass_x, search, mass_search, y;
+  std::vector<V> velocity, smooth, x, mass_x, search, mass_search, y, scaled;
 
-  Block(ffi::Span<const int32_t> packed, ffi::Span<const float> numbers,
-        int iterations);
+  Block(ffi::Span<const int32_t> packed, ffi::Span<const float> numbers);
   void load(const Given& given, const int* env);
   void solve(const int* env, int count, float* qacc, float* force);
 
@@ -88,14 +93,19 @@ struct Block {
   void times_mass(const std::vector<V>& in, std::vector<V>& out) const;
   void times_rows(const std::vector<V>& in, std::vector<V>& out) const;
   I active(int row, V residual) const;
+  template <int N>
+  void times_some(const Part& part, int r, const std::vector<V>& in,
+                  std::vector<V>& out) const;
   void assemble();
+  template <int N>
+  void assemble_some(Part& part, int r);
+  template <int N>
+  void eliminate(Part& part, int p);
   void factor();
   V line_search(V gauss_1, V gauss_2) const;
 };
 
-Block::Block(ffi::Span<const int32_t> packed, ffi::Span<const float> numbers,
-             int iterations)
-    : iterations(iterations) {
+Block::Block(ffi::Span<const int32_t> packed, ffi::Span<const float> numbers) {
   const int32_t* at = packed.begin();
   for (int* number : {&nv, &num_rows, &num_equality, &num_given, &num_bodies})
     *number = *at++;
@@ -125,8 +135,15 @@ Block::Block(ffi::Span<const int32_t> packed, ffi::Span<const float> numbers,
     part.mass.resize(size * size);
     part.front.resize(size * size);
     part.J.resize(rows * size);
+    // What couples the core's own unknowns is left to the core.
+    for (int i = 0; i < size; ++i)
+      for (int j = 0; j <= std::min(i, part.own - 1); ++j) {
+        const auto [low, high] = std::minmax(part.dofs[i], part.dofs[j]);
+        if (moves(low, high)) part.entries.push_back({i * size + j, high, low});
+      }
     parts.push_back(std::move(part));
   }
+  scaled.resize(3 * nv);
   for (auto* v : {&motion, &momentum}) v->resize(nv * 6);
   inertia.resize(10 * num_bodies), center.resize(3 * num_bodies);
   given_J.resize(num_given * nv);
@@ -164,20 +181,12 @@ void Block::load(const Given& given, const int* env) {
 void Block::make_masses() {
   for (int i = 0; i < nv; ++i)
     times_inertia(&inertia[10 * body[i]], &motion[6 * i], &momentum[6 * i]);
-  for (Part& part : parts) {
-    const int size = part.size();
-    for (int i = 0; i < size; ++i) {
-      // What couples the core's own unknowns is left to the core.
-      for (int j = 0; j <= std::min(i, part.own - 1); ++j) {
-        const int high = std::max(part.dofs[i], part.dofs[j]);
-        const int low = std::min(part.dofs[i], part.dofs[j]);
-        V sum{};
-        if (moves(low, high))
-          for (int k = 0; k < 6; ++k) sum += momentum[6 * high + k] * motion[6 * low + k];
-        part.mass[i * size + j] = i == j ? sum + armature[high] : sum;
-      }
+  for (Part& part : parts)
+    for (const auto [at, high, low] : part.entries) {
+      V sum = high == low ? all(armature[high]) : V{};
+      for (int k = 0; k < 6; ++k) sum += momentum[6 * high + k] * motion[6 * low + k];
+      part.mass[at] = sum;
     }
-  }
 }
 
 // The impedance of a contact, between `low` and `high`.
@@ -212,8 +221,8 @@ void Block::make_rows(const Given& given, const int* env) {
       const int row = part.rows[r];
       if (row >= num_given) {
         const int c = (row - num_given) / 4;
-        if (!touching[c]) continue;
-        if ((row - num_given) % 4 == 0) make_contact(part, r);
+        if (!touching[c] || (row - num_given) % 4) continue;
+        make_contact(part, r);
       } else {
         for (int i = 0; i < size; ++i)
           part.J[r * size + i] = given_J[row * nv + part.dofs[i]];
@@ -286,14 +295,24 @@ void Block::times_mass(const std::vector<V>& in, std::vector<V>& out) const {
 }
 
 void Block::times_rows(const std::vector<V>& in, std::vector<V>& out) const {
-  for (const Part& part : parts) {
-    const int size = part.size();
-    for (int r : part.live) {
-      V sum{};
-      for (int i = 0; i < size; ++i) sum += part.J[r * size + i] * in[part.dofs[i]];
-      out[part.rows[r]] = sum;
-    }
+  for (const Part& part : parts)
+    for (int r : part.live)
+      part.rows[r] < num_given ? times_some<1>(part, r, in, out)
+                               : times_some<4>(part, r, in, out);
+}
+
+// Of N rows, from r on. Sums that do not wait for one another are made at the same time.
+template <int N>
+void Block::times_some(const Part& part, int r, const std::vector<V>& in,
+                       std::vector<V>& out) const {
+  const int size = part.size();
+  const V* J = &part.J[r * size];
+  V sum[N] = {};
+  for (int i = 0; i < size; ++i) {
+    const V x = in[part.dofs[i]];
+    for (int n = 0; n < N; ++n) sum[n] += J[n * size + i] * x;
   }
+  for (int n = 0; n < N; ++n) out[part.rows[r] + n] = sum[n];
 }
 
 inline I Block::active(int row, V of) const {
@@ -310,41 +329,77 @@ void Block::assemble() {
     for (int i = 0; i < size; ++i)
       for (int j = 0; j <= i; ++j)
         part.front[i * size + j] = j < part.own ? part.mass[i * size + j] : V{};
-    for (int r : part.live) {
-      const V w = weight[part.rows[r]];
-      if (!any(w != 0.0f)) continue;
-      const V pull = w * residual[part.rows[r]];
-      const V* J = &part.J[r * size];
-      for (int i = 0; i < size; ++i) {
-        y[part.dofs[i]] -= J[i] * pull;
-        const V weighted = w * J[i];
-        V* row = &part.front[i * size];
-        for (int j = 0; j <= i; ++j) row[j] += weighted * J[j];
-      }
+    for (int r : part.live)
+      part.rows[r] < num_given ? assemble_some<1>(part, r) : assemble_some<4>(part, r);
+  }
+}
+
+// What N rows add, from r on.
+template <int N>
+void Block::assemble_some(Part& part, int r) {
+  const int size = part.size();
+  const V* J = &part.J[r * size];
+  V w[N], pull[N];
+  I acts{};
+  for (int n = 0; n < N; ++n) {
+    w[n] = weight[part.rows[r] + n];
+    pull[n] = w[n] * residual[part.rows[r] + n];
+    acts |= w[n] != 0.0f;
+  }
+  if (!any(acts)) return;
+  for (int i = 0; i < size; ++i) {
+    V weighted[N], back{};
+    for (int n = 0; n < N; ++n) {
+      weighted[n] = w[n] * J[n * size + i];
+      back += J[n * size + i] * pull[n];
+    }
+    y[part.dofs[i]] -= back;
+    V* row = &part.front[i * size];
+    for (int j = 0; j <= i; ++j) {
+      V sum = row[j];
+      for (int n = 0; n < N; ++n) sum += weighted[n] * J[n * size + j];
+      row[j] = sum;
     }
   }
+}
+
+// Eliminates N unknowns of a part, from p on; below the diagonal the factors stay.
+template <int N>
+void Block::eliminate(Part& part, int p) {
+  const int size = part.size(), next = p + N;
+  V* F = part.front.data();
+  for (int n = 0; n < N; ++n) {
+    const int q = p + n;
+    const V inverse = 1.0f / F[q * size + q], right = y[part.dofs[q]];
+    for (int i = q + 1; i < size; ++i) {
+      const V factor = F[i * size + q] * inverse;
+      y[part.dofs[i]] -= factor * right;
+      for (int j = q + 1; j < next && j <= i; ++j)
+        F[i * size + j] -= factor * F[j * size + q];
+      scaled[N * i + n] = factor;
+    }
+    F[q * size + q] = inverse;
+  }
+  for (int i = next; i < size; ++i)
+    for (int j = next; j <= i; ++j) {
+      V sum = F[i * size + j];
+      for (int n = 0; n < N; ++n) sum -= scaled[N * i + n] * F[j * size + p + n];
+      F[i * size + j] = sum;
+    }
+  for (int n = 0; n < N; ++n)
+    for (int i = p + n + 1; i < size; ++i) F[i * size + p + n] = scaled[N * i + n];
 }
 
 // Eliminates limb after limb, then the core, and substitutes: search = H^-1 y.
 void Block::factor() {
   Part& core = parts.back();
   const int width = core.size();
-  V scaled[64];
   for (Part& part : parts) {
     const int size = part.size();
-    V* F = part.front.data();
-    for (int p = 0; p < part.own; ++p) {
-      const V inverse = 1.0f / F[p * size + p];
-      const V right = y[part.dofs[p]];
-      for (int i = p + 1; i < size; ++i) {
-        scaled[i] = F[i * size + p] * inverse;
-        y[part.dofs[i]] -= scaled[i] * right;
-        V* row = F + i * size;
-        for (int j = p + 1; j <= i; ++j) row[j] -= scaled[i] * F[j * size + p];
-      }
-      for (int i = p + 1; i < size; ++i) F[i * size + p] = scaled[i];
-      F[p * size + p] = inverse;
-    }
+    const V* F = part.front.data();
+    int p = 0;
+    for (; p + 3 <= part.own; p += 3) eliminate<3>(part, p);
+    for (; p < part.own; ++p) eliminate<1>(part, p);
     if (&part == &core) break;
     for (int i = part.own; i < size; ++i)
       for (int j = part.own; j <= i; ++j) {
@@ -434,8 +489,8 @@ ffi::Error Newton(Floats inertia, Floats motion, Floats center, Floats velocity,
                     velocity.typed_data(), smooth.typed_data(), start.typed_data(),
                     J.typed_data(),        D.typed_data(),      aref.typed_data(),
                     dist.typed_data(),     frame.typed_data(),  point.typed_data()};
-  // The same number for every environment of a batch.
-  Block block(structure, numbers, most.typed_data()[0]);
+  Block& block = kept<Block>(structure, numbers);
+  block.iterations = most.typed_data()[0];  // the same for every environment of a batch
   const int64_t batch = smooth.element_count() / block.nv;
   for_each_block(batch, [&](const int* env, int count) {
     block.load(given, env);
