@@ -17,6 +17,7 @@ from dcc_jax.learn.contract import Environment
 from dcc_jax.learn.discriminator import Pairs
 
 Array = jax.Array
+_SHARE_OF_RESETS = 16  # of the environments, one in so many is reset at once
 
 
 @flax.struct.dataclass
@@ -252,16 +253,30 @@ def _final_value(actors: Actors, env: Any, discount: float) -> Array:
 def _auto_reset(
     keys: Array, environment: Environment, actors: Actors, before: Running, env: Any
 ) -> Running:
-    ends = env.terminated | env.truncated
+    """Where episodes end others begin, a few at a time: few end in any one step."""
+    count = before.steps.shape[0]
+    few = -(-count // _SHARE_OF_RESETS)
+    # The checker of keys takes a loop for a second use.
+    data, impl = jax.random.key_data(keys), jax.random.key_impl(keys)
 
-    def renewed(running: Running) -> Running:
-        fresh = reset_all(keys, environment, actors.alpha, before.span)
-        return jax.tree.map(lambda new, old: _where(ends, new, old), fresh, running)
+    def renewed(state: tuple[Running, Array]) -> tuple[Running, Array]:
+        running, left = state
+        (chosen,) = jnp.nonzero(left, size=few, fill_value=0)
+        of_chosen = jax.random.wrap_key_data(data[chosen], impl=impl)
+        fresh = reset_all(of_chosen, environment, actors.alpha, before.span)
+        place = jnp.cumsum(left) - 1  # of an environment among the chosen
+        now, at = left & (place < few), jnp.clip(place, 0, few - 1)
+        running = jax.tree.map(
+            lambda new, old: _where(now, new[at], old), fresh, running
+        )
+        return running, left & ~now
 
     going_on = Running(
         env=env, steps=before.steps + 1, earlier=before.remembered[:, 1:]
     )
-    return jax.lax.cond(jnp.any(ends), renewed, lambda running: running, going_on)
+    ends = env.terminated | env.truncated
+    state = going_on, ends
+    return jax.lax.while_loop(lambda state: jnp.any(state[1]), renewed, state)[0]
 
 
 def _recorded(incident: Incident, nan: Array, env: Any, action: Array) -> Incident:
