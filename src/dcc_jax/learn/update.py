@@ -149,9 +149,10 @@ def _train_discriminator(
     normal = state.feature_normalizer
     x_expert = discriminator.inputs(normal, expert, config.disc)
     x_policy = discriminator.inputs(normal, policy, config.disc)
-    blurred = discriminator.blurred(
-        noise_key, jnp.stack([x_expert, x_policy]), flat.s.shape[-1], config.disc
-    )
+    # The same noise on both sets: random numbers are a twentieth of an update.
+    blurred = jax.vmap(
+        lambda x: discriminator.blurred(noise_key, x, flat.s.shape[-1], config.disc)
+    )(jnp.stack([x_expert, x_policy]))
     of_expert, of_policy = blurred.reshape(2, config.disc.minibatches, size, -1)
     disc, metrics = discriminator.update(
         state.disc, of_expert, of_policy, config.disc, AXIS
