@@ -185,6 +185,21 @@ def algebra(model: mujoco.MjModel):
 
 
 @pytest.mark.parametrize("model", [CHARACTER, MIXED], ids=["character", "mixed"])
+@pytest.mark.parametrize("pairs", [1, 3, 12])
+def test_parts_of_coordinates_join_to_what_they_were(pairs):
+    """Hinges and ball joints by turns: few runs of neighbours, and many."""
+    kinds = ("hinge", "ball") * pairs
+    inside = "".join(f"<body><joint type='{k}'/><geom size='.1'/>" for k in kinds)
+    xml = f"<mujoco><worldbody>{inside}{'</body>' * 2 * pairs}</worldbody></mujoco>"
+    coords = quat.Coordinates.of(mujoco.MjModel.from_xml_string(xml))
+    q, v = jnp.arange(5.0 * pairs), jnp.arange(4.0 * pairs)
+    scalars, quats = coords.split_q(q)
+    np.testing.assert_array_equal(scalars, q[::5])
+    np.testing.assert_array_equal(quats, q.reshape(pairs, 5)[:, 1:])
+    np.testing.assert_array_equal(coords.join_q(scalars, quats), q)
+    np.testing.assert_array_equal(coords.join_v(*coords.split_v(v)), v)
+
+
 def test_ominus_undoes_oplus_and_oplus_undoes_ominus(model):
     oplus, ominus, _, _ = algebra(model)
     q, u = random_q(model, 9), random_q(model, 10)

@@ -202,7 +202,7 @@ class Coordinates:
         return _entries(flat, np.argsort(order))
 
 
-_MAX_RUNS = 8
+_MOST_SLICES = 8  # beyond them one gather is no slower
 
 
 def _entries(x: Array, indices: np.ndarray) -> Array:
@@ -210,7 +210,7 @@ def _entries(x: Array, indices: np.ndarray) -> Array:
     flat = indices.ravel()
     runs = np.split(flat, np.flatnonzero(np.diff(flat) != 1) + 1) if len(flat) else []
     parts = [x[..., run[0] : run[-1] + 1] for run in runs]
-    if not 1 <= len(parts) <= _MAX_RUNS:
+    if not 1 <= len(parts) <= _MOST_SLICES:
         return x[..., indices]
     part = parts[0] if len(parts) == 1 else jnp.concatenate(parts, axis=-1)
     return part.reshape(*x.shape[:-1], *indices.shape)
