@@ -184,7 +184,6 @@ def algebra(model: mujoco.MjModel):
     return [jax.jit(functools.partial(operation, coords)) for operation in operations]
 
 
-@pytest.mark.parametrize("model", [CHARACTER, MIXED], ids=["character", "mixed"])
 @pytest.mark.parametrize("pairs", [1, 3, 12])
 def test_parts_of_coordinates_join_to_what_they_were(pairs):
     """Hinges and ball joints by turns: few runs of neighbours, and many."""
@@ -200,6 +199,7 @@ def test_parts_of_coordinates_join_to_what_they_were(pairs):
     np.testing.assert_array_equal(coords.join_v(*coords.split_v(v)), v)
 
 
+@pytest.mark.parametrize("model", [CHARACTER, MIXED], ids=["character", "mixed"])
 def test_ominus_undoes_oplus_and_oplus_undoes_ominus(model):
     oplus, ominus, _, _ = algebra(model)
     q, u = random_q(model, 9), random_q(model, 10)
