@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from dcc_jax.training.verdict import verdict
 
 
-def _rows(nearest: list[float], margin: float | None = None) -> list[dict]:
-    rows = [{"style/nearest": x, "style/floor": 0.004} for x in nearest]
-    if margin is not None:
-        rows = [row | {"disc/margin": margin} for row in rows]
-    return rows
+def _rows(nearest: list[float], margin: float = 0.5) -> list[dict]:
+    measured = {"style/floor": 0.004, "disc/margin": margin}
+    return [measured | {"style/nearest": x} for x in nearest]
 
 
 def test_nothing_is_said_before_anything_is_measured():
@@ -20,7 +19,7 @@ def test_nothing_is_said_before_anything_is_measured():
 
 def test_a_measurement_of_environments_that_were_just_reset_is_left_out():
     rows = [*_rows([0.02, 0.01]), {"style/nearest": None, "style/floor": 0.004}]
-    assert verdict(rows) == "the motion is 10 mm away from its clips"
+    assert verdict(rows) == verdict(rows[:-1])
 
 
 @pytest.mark.parametrize(
@@ -33,13 +32,23 @@ def test_a_measurement_of_environments_that_were_just_reset_is_left_out():
     ],
 )
 def test_distance_is_told_with_its_trend(nearest, trend):
-    expected = f"the motion is {1e3 * nearest[-1]:.0f} mm away from its clips"
+    expected = f"the motion is {1e3 * nearest[-1]:.0f} mm away from its clips, "
+    expected += f"{nearest[-1] / 0.004:.1f} times the floor"
     assert verdict(_rows(nearest)) == expected + trend
 
 
-def test_distance_is_told_in_floors_where_a_discriminator_learns():
-    said = verdict(_rows([0.02, 0.01], margin=0.5))
-    assert said == "the motion is 10 mm away from its clips, 2.5 times the floor"
+@pytest.mark.parametrize(
+    ("r_q", "expected"),
+    [
+        (np.linspace(0.5, 0.7, 20), "r_q = 0.69, of 1 at most, still rising"),
+        (np.linspace(0.7, 0.5, 20), "r_q = 0.51, of 1 at most, falling"),
+        (np.full(40, 0.7), "r_q = 0.70, of 1 at most, no longer rising"),
+    ],
+)
+def test_where_no_discriminator_learns_the_reward_of_tracking_is_told(r_q, expected):
+    rows = [{"reward/r_q": x, "style/nearest": 0.1, "style/floor": 0.0} for x in r_q]
+    assert verdict(rows) == f"it follows its reference with {expected}"
+    assert verdict(rows[:9]) == ""
 
 
 @pytest.mark.parametrize(("margin", "won"), [(1.8, True), (1.2, False)])
