@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 
 import jax
@@ -187,3 +188,18 @@ def test_the_kernel_can_be_switched_off(forgetful):
 
 def test_source_of_the_kernel_travels_with_the_package():
     assert (native.SOURCES / "newton.cc").is_file()
+
+
+@pytest.mark.parametrize(
+    ("compiler", "why"),
+    [("/nowhere/c++ -O1", "CXX=/nowhere/c++ is no program"), ("true", "no library")],
+)
+def test_a_compiler_that_is_none_is_named(monkeypatch, compiler, why):
+    monkeypatch.setenv("CXX", compiler)
+    with pytest.raises(OSError, match=re.escape(why)):
+        native._made.__wrapped__()
+
+
+def test_a_compiler_may_have_options(monkeypatch):
+    monkeypatch.setenv("CXX", "c++ -O1")
+    assert native._compiler() == ["c++", "-O1"]

@@ -174,6 +174,49 @@ def test_springs_and_dampers_equal_c_mujoco(character: Character, turning: bool)
     np.testing.assert_allclose(pad, data.qacc[42:], rtol=1e-4, atol=1e-3)
 
 
+@pytest.mark.parametrize("flag", ["SPRING", "DAMPER"])
+def test_springs_and_dampers_can_be_switched_off(character: Character, flag: str):
+    model = compose_scene(character, floor=False, extend=_with_slide(stiffness=300.0))
+    model.opt.disableflags |= getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}")
+    scene = physics.make_scene(model, character)
+    data = mujoco.MjData(scene.model)
+    data.qpos[-1], data.qvel[-1] = 0.2, 0.5
+    mujoco.mj_forward(scene.model, data)
+    state = physics.initial_state(
+        scene, jnp.asarray(data.qpos, jnp.float32), jnp.asarray(data.qvel, jnp.float32)
+    )
+    kin = physics.kinematics(scene, state)
+    found = jax.jit(lambda: physics.solve(scene, kin, state, jnp.zeros(model.nv)))()
+    np.testing.assert_allclose(found.qacc[-1], data.qacc[-1], rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("given", "limits"),
+    [({"frictionloss": 5.0}, True), ({"frictionloss": 5.0}, False), ({}, False)],
+)
+def test_constraints_that_the_solver_does_not_know_are_refused(
+    character, given, limits
+):
+    model = compose_scene(character, floor=False, extend=_with_slide(**given))
+    if not limits:
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
+    with pytest.raises(ValueError, match="the contact solver knows contacts"):
+        physics.make_scene(model, character)
+
+
+def _with_slide(stiffness: float = 0.0, **given):
+    """Adds a body on a vertical slide beside the character."""
+
+    def extend(spec: mujoco.MjSpec) -> None:
+        body = spec.worldbody.add_body(name="pad", pos=[2, 0, 1])
+        body.add_geom(size=[0.1, 0.1, 0.1], mass=3.0, contype=0, conaffinity=0)
+        springs = {"stiffness": [stiffness, 0, 0], "damping": [7.0, 0, 0]}
+        slide = mujoco.mjtJoint.mjJNT_SLIDE
+        body.add_joint(type=slide, axis=[0, 0, 1], range=[-1, 1], **springs, **given)
+
+    return extend
+
+
 def test_stable_pd_is_the_explicit_equation(character: Character):
     """(M + h Kv) qdd = Kp (q_bar - q - h qd) - Kv qd - bias, in double precision."""
     plain = compose_scene(character, floor=False)

@@ -151,7 +151,7 @@ def rollout(
         return _rollout(draws, environment, actors, running, config)
     chunks = count // chunk
     split = jax.tree.map(lambda x: x.reshape(chunks, chunk, *x.shape[1:]), running)
-    # Drawn before the split: the size of a chunk changes no number.
+    # Drawn before the split: the size of a chunk changes no draw.
     shares = jax.tree.map(lambda x: _divided(x, chunks), draws)
     parts: Rollout = jax.lax.map(
         lambda part: _rollout(part[0], environment, actors, part[1], config),

@@ -138,11 +138,9 @@ def kinematics(tree: Tree, data: mjx.Data) -> mjx.Data:
         [jax.ShapeDtypeStruct(shape, np.float32) for shape in shapes],
         vmap_method="broadcast_all",
     )
+    given = data.qpos, data.qvel, data.mocap_pos, data.mocap_quat
     made = call(
-        data.qpos,
-        data.qvel,
-        data.mocap_pos,
-        data.mocap_quat,
+        *(x.astype(np.float32) for x in given),  # where jax is told of double precision
         structure=tree.structure,
         numbers=tree.numbers,
     )

@@ -14,6 +14,7 @@ import hashlib
 import importlib.util
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 import sys
@@ -94,6 +95,8 @@ def _made() -> Path:
         with tempfile.TemporaryDirectory(dir=folder) as work:
             made = Path(work) / "kernels.so"
             build(SOURCES.glob("*.cc"), made)
+            if not made.exists():
+                raise OSError(f"{' '.join(_compiler())} made no library")
             made.replace(library)
     return library
 
@@ -117,8 +120,12 @@ def build(sources: Iterable[Path], library: Path) -> None:
 
 
 def _compiler() -> list[str]:
-    for name in (os.environ.get("CXX"), "c++", "g++", "clang++"):
-        if name and shutil.which(name):
+    if asked := shlex.split(os.environ.get("CXX", "")):
+        if shutil.which(asked[0]):
+            return asked
+        raise OSError(f"CXX={asked[0]} is no program")
+    for name in ("c++", "g++", "clang++"):
+        if shutil.which(name):
             return [name]
     if importlib.util.find_spec("ziglang"):
         return [sys.executable, "-m", "ziglang", "c++"]
@@ -136,5 +143,6 @@ def _processor() -> str:
 
 def _reason(error: Exception) -> str:
     if isinstance(error, subprocess.CalledProcessError):
-        return next((x for x in error.stderr.splitlines() if "error" in x), str(error))
+        said = error.stderr.splitlines() or [str(error)]
+        return next((line for line in said if "error" in line), said[0])
     return str(error)

@@ -127,7 +127,8 @@ def make_scene(
         newton_iterations: of the contact solver, at most (docs/performance.md).
 
     Raises:
-        ValueError: no joint `root`, or `newton_iterations` < 1.
+        ValueError: no joint `root`, `newton_iterations` < 1, or constraints that the
+            contact solver does not know.
     """
     if newton_iterations < 1:
         raise ValueError(f"newton_iterations must be >= 1, got {newton_iterations}")
@@ -142,6 +143,15 @@ def make_scene(
     template = mjx.make_data(mjx_model)
     contacts = _contacts(mjx_model, template)
     contact_bodies = model.geom_bodyid[contacts.geom]
+    pattern, rows = _row_pattern(model, contact_bodies), template._impl
+    limits = int(model.jnt_limited.sum())
+    known = len(pattern) == rows.nefc and limits == rows.nl and rows.nf == 0
+    if not known or np.any(contacts.dim != 3):
+        raise ValueError(
+            "the contact solver knows contacts of condim 3, limits of joints, and the "
+            "equalities connect and weld; the model has other constraints (friction "
+            "loss, tendons, other equalities or condims), or switches these off"
+        )
     return Scene(
         model=model,
         character=character,
@@ -156,7 +166,7 @@ def make_scene(
         moves=np.array([_chain(model, body) for body in range(model.nbody)]),
         tree=Tree.of(model, contacts),
         layout=Layout.of(model, contacts, template._impl.ne),
-        arrow=arrow(model, _row_pattern(model, contact_bodies)),
+        arrow=arrow(model, pattern),
         mass_arrow=arrow(model, np.zeros((0, model.nv), bool)),
     )
 

@@ -31,6 +31,8 @@ from dcc_jax.physics.scene import Scene
 
 Array = jax.Array
 _FREE, _BALL = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
+_NO_SPRING = mujoco.mjtDisableBit.mjDSBL_SPRING
+_NO_DAMPER = mujoco.mjtDisableBit.mjDSBL_DAMPER
 
 
 @flax.struct.dataclass
@@ -56,7 +58,8 @@ class Kinematics:
     """What follows from positions and velocities alone.
 
     Of `data`, without the kernel, all that MJX's stages have; with it, those fields
-    that `kinematics_kernel.FIELDS` names, and the contacts.
+    that `kinematics_kernel.FIELDS` names, and the contacts. Where the kernel collides,
+    poses of geoms are not among them.
     """
 
     data: mjx.Data
@@ -172,12 +175,14 @@ def _passive(scene: Scene, data: mjx.Data) -> Array:
     MJX has all else that is passive, but takes logarithms of joints without a spring.
     """
     model, dtype = scene.model, data.qvel.dtype
-    sprung = np.flatnonzero(model.jnt_stiffness)
+    off = model.opt.disableflags
+    sprung = np.flatnonzero(model.jnt_stiffness * (not off & _NO_SPRING))
+    damping = model.dof_damping * (not off & _NO_DAMPER)
     turning = np.isin(model.jnt_type[sprung], (_FREE, _BALL)).any()
     fluid = scene.mjx_model.opt._impl.has_fluid_params
     if turning or fluid or model.ntendon or model.body_gravcomp.any():
         return mjx.passive(scene.mjx_model, data).qfrc_passive
-    force = -jnp.asarray(model.dof_damping, dtype) * data.qvel
+    force = -jnp.asarray(damping, dtype) * data.qvel
     if len(sprung):
         at = model.jnt_qposadr[sprung]
         stretch = data.qpos[at] - jnp.asarray(model.qpos_spring[at], dtype)

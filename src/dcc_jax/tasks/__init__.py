@@ -69,6 +69,8 @@ def _clip(name: str) -> Clip:
         imported = import_motion(path, Options())
         print(f"{name}: imported; {verdict(imported.doubts)}", file=sys.stderr)
         return imported.clip
+    if path.is_dir():
+        raise MotionError(path, "is a directory; a clip is a file")
     if path.is_file():
         known = ", ".join((".npz", *MOTION_ENDINGS))
         raise MotionError(path, f"not a motion: its name ends in none of {known}")

@@ -54,7 +54,9 @@ def check(run_dir: Path, wanted: Config, resume: bool) -> None:
                 f"{run_dir} holds a policy and no checkpoint, so it cannot be resumed; "
                 f"--train.start-from {run_dir} begins a new run with the policy"
             )
-    elif run_dir.exists() and (not run_dir.is_dir() or any(run_dir.iterdir())):
+    elif run_dir.exists() and not run_dir.is_dir():
+        raise ValueError(f"run_dir {run_dir} is a file")
+    elif run_dir.exists() and any(run_dir.iterdir()):
         raise ValueError(
             f"run_dir {run_dir} exists and is not empty; --resume continues a run"
         )

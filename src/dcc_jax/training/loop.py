@@ -91,6 +91,8 @@ def prepare(
         run_dir = default_run_dir(wanted.task.name)
     place = Path(run_dir)
     runtime.ensure()
+    if jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        raise ValueError("a training is in single precision: unset JAX_ENABLE_X64")
     processes.by_the_first(lambda: folder.check(place, wanted, resume))
     if environment is None:
         environment = make_environment(wanted)

@@ -51,6 +51,7 @@ Made& kept(const Structure& structure, const Numbers& numbers) {
     return std::equal(a.begin(), a.end(), b.begin(), b.end());
   };
   if (!made || !same(whole, structure) || !same(real, numbers)) {
+    made.reset();
     whole.assign(structure.begin(), structure.end());
     real.assign(numbers.begin(), numbers.end());
     made = std::make_unique<Made>(structure, numbers);
