@@ -3,7 +3,7 @@
     python benchmarks/operations.py [TASK] [--updates 6] [--top 40]
 
 A row is a group of compiled operations that come from the same line of our program:
-microseconds of one core for each tuple, and the share of all. Kernels are `ffi_call`;
+microseconds for each tuple, and the share of all. Kernels are `ffi_call`;
 what XLA made itself, such as copies, has no line. Environments begin anew and the
 policy is untrained. One device with the environments of one of two.
 """
@@ -16,6 +16,7 @@ import gzip
 import json
 import re
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,9 @@ from dcc_jax.config import make_config  # noqa: E402
 from dcc_jax.learn import learner  # noqa: E402
 
 # What is not one operation: loops, branches, the runtime and Python.
-GROUPS = re.compile(r"\$|(while|cond|conditional|call)[.\d]*$|.*(Execut|Pjit|Await|::)")
+GROUPS = re.compile(
+    r"\$|end: |(while|cond|conditional|call)[.\d]*$|.*(Execut|Pjit|Await|::)"
+)
 WARM_UP = 3  # updates before the trace
 
 
@@ -40,7 +43,7 @@ def lines_of(program: Any) -> dict[str, str]:
     return {found[1]: found[2] for found in named}
 
 
-def traced(run: Any) -> collections.Counter[str]:
+def traced(run: Callable[[], None]) -> collections.Counter[str]:
     """Microseconds of every operation in a call of `run`."""
     with tempfile.TemporaryDirectory() as folder:
         with jax.profiler.trace(folder):

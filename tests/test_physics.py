@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -13,6 +16,7 @@ from dcc_jax.character import Character, compose_scene
 from dcc_jax.control import pd
 
 BATCH = 8
+_SLIDE = mujoco.mjtJoint.mjJNT_SLIDE
 
 
 def _random_poses(scene: physics.Scene, seed: int, spread: float) -> np.ndarray:
@@ -142,20 +146,26 @@ def test_generalized_force_equals_c_mujoco(scene, landing, names):
         np.testing.assert_allclose(found, theirs, atol=1e-5 * np.abs(theirs).max())
 
 
-@pytest.mark.parametrize("turning", [False, True], ids=["slide and hinge", "ball"])
-def test_springs_and_dampers_equal_c_mujoco(character: Character, turning: bool):
-    def sprung(spec: mujoco.MjSpec) -> None:
+def _with_pad(*joints: dict[str, Any]) -> Callable[[mujoco.MjSpec], None]:
+    """Adds a body beside the character that moves by these joints."""
+
+    def extend(spec: mujoco.MjSpec) -> None:
         body = spec.worldbody.add_body(name="pad", pos=[2, 0, 1])
         body.add_geom(size=[0.1, 0.1, 0.1], mass=3.0, contype=0, conaffinity=0)
-        given = dict(stiffness=[300.0, 0, 0], damping=[7.0, 0, 0])
-        if turning:
-            body.add_joint(type=mujoco.mjtJoint.mjJNT_BALL, **given)
-        else:
-            slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
-            body.add_joint(type=slide, axis=[0, 0, 1], springref=0.3, **given)
-            body.add_joint(type=hinge, axis=[0, 1, 0], **given)
+        for joint in joints:
+            body.add_joint(**joint)
 
-    model = compose_scene(character, floor=False, extend=sprung)
+    return extend
+
+
+@pytest.mark.parametrize("turning", [False, True], ids=["slide and hinge", "ball"])
+def test_springs_and_dampers_equal_c_mujoco(character: Character, turning: bool):
+    given = {"stiffness": [300.0, 0, 0], "damping": [7.0, 0, 0]}
+    slide = {"type": _SLIDE, "axis": [0, 0, 1], "springref": 0.3}
+    hinge = {"type": mujoco.mjtJoint.mjJNT_HINGE, "axis": [0, 1, 0]}
+    ball = {"type": mujoco.mjtJoint.mjJNT_BALL}
+    joints = [joint | given for joint in ([ball] if turning else [slide, hinge])]
+    model = compose_scene(character, floor=False, extend=_with_pad(*joints))
     scene = physics.make_scene(model, character)
     rng, data = np.random.default_rng(5), mujoco.MjData(scene.model)
     turned = 0.4 * rng.normal(size=model.nv)
@@ -176,7 +186,8 @@ def test_springs_and_dampers_equal_c_mujoco(character: Character, turning: bool)
 
 @pytest.mark.parametrize("flag", ["SPRING", "DAMPER"])
 def test_springs_and_dampers_can_be_switched_off(character: Character, flag: str):
-    model = compose_scene(character, floor=False, extend=_with_slide(stiffness=300.0))
+    slide = {"type": _SLIDE, "stiffness": [300.0, 0, 0], "damping": [7.0, 0, 0]}
+    model = compose_scene(character, floor=False, extend=_with_pad(slide))
     model.opt.disableflags |= getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}")
     scene = physics.make_scene(model, character)
     data = mujoco.MjData(scene.model)
@@ -197,24 +208,12 @@ def test_springs_and_dampers_can_be_switched_off(character: Character, flag: str
 def test_constraints_that_the_solver_does_not_know_are_refused(
     character, given, limits
 ):
-    model = compose_scene(character, floor=False, extend=_with_slide(**given))
+    slide = {"type": _SLIDE, "range": [-1, 1]} | given
+    model = compose_scene(character, floor=False, extend=_with_pad(slide))
     if not limits:
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
     with pytest.raises(ValueError, match="the contact solver knows contacts"):
         physics.make_scene(model, character)
-
-
-def _with_slide(stiffness: float = 0.0, **given):
-    """Adds a body on a vertical slide beside the character."""
-
-    def extend(spec: mujoco.MjSpec) -> None:
-        body = spec.worldbody.add_body(name="pad", pos=[2, 0, 1])
-        body.add_geom(size=[0.1, 0.1, 0.1], mass=3.0, contype=0, conaffinity=0)
-        springs = {"stiffness": [stiffness, 0, 0], "damping": [7.0, 0, 0]}
-        slide = mujoco.mjtJoint.mjJNT_SLIDE
-        body.add_joint(type=slide, axis=[0, 0, 1], range=[-1, 1], **springs, **given)
-
-    return extend
 
 
 def test_stable_pd_is_the_explicit_equation(character: Character):

@@ -57,9 +57,7 @@ class Tree:
 
     structure: np.ndarray  # [n] int32
     numbers: np.ndarray  # [m] float32, lengths in m, masses in kg
-    shapes: dict[
-        str, tuple[int, ...]
-    ]  # of what the kernel fills in: geoms for MJX only
+    shapes: dict[str, tuple[int, ...]]  # of what it fills in; geoms if MJX collides
     contacts: mjx.Contact  # what is static of the scene's
     collides: bool  # whether the kernel knows every pair of geoms that may touch
 
@@ -144,9 +142,8 @@ def kinematics(tree: Tree, data: mjx.Data) -> mjx.Data:
         structure=tree.structure,
         numbers=tree.numbers,
     )
-    names = [name for name, _, _ in FIELDS]
-    filled = dict(zip(names, made[: len(FIELDS)], strict=True))
-    filled = {name: filled[name] for name in tree.shapes}
+    fields = zip(FIELDS, made[: len(FIELDS)], strict=True)
+    filled = {name: value for (name, *_), value in fields if name in tree.shapes}
     if tree.collides:
         names = [name for name, _ in CONTACT_FIELDS]
         found = dict(zip(names, made[len(FIELDS) :], strict=True))
