@@ -33,7 +33,7 @@ import jax  # noqa: E402
 import states  # noqa: E402
 import stepping  # noqa: E402
 
-from dcc_jax.physics import native  # noqa: E402
+from dcc_jax import native  # noqa: E402
 
 COUNT = 128  # environments
 COLUMNS = (

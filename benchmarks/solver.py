@@ -25,10 +25,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dcc_jax import physics, tasks
+from dcc_jax import native, physics, tasks
 from dcc_jax.config import make_config
 from dcc_jax.env.environment import Environment
-from dcc_jax.physics import contact_solver, native, newton_kernel
+from dcc_jax.physics import contact_solver, newton_kernel
 from dcc_jax.physics.quiet_mjx import mjx
 
 Array = jax.Array

@@ -16,7 +16,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "src" / "dcc_jax"
 # One line a level, lowest first. A module belongs to the longest name here that it is
 # or lies in, and imports only rooms of lower levels and its own.
 LEVELS = [
-    {"quat", "draws", "character", "runtime", "viz", "motion.formats"},
+    {"quat", "draws", "character", "runtime", "native", "viz", "motion.formats"},
     {"physics", "control", "motion", "command"},
     {"motion.retarget", "env"},
     {"motion.inspect", "tasks"},

@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from dcc_jax import physics
+from dcc_jax import native, physics
 from dcc_jax.character import Character, compose_scene
-from dcc_jax.physics import kinematics_kernel, native
+from dcc_jax.physics import kinematics_kernel
 from dcc_jax.physics import scene as scenes
 from dcc_jax.physics.kinematics_kernel import CONTACT_FIELDS, FIELDS, PAIRS, Tree
 from dcc_jax.physics.quiet_mjx import mjx

@@ -11,8 +11,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from dcc_jax import physics
-from dcc_jax.physics import contact_solver, native, newton_kernel
+from dcc_jax import native, physics
+from dcc_jax.physics import contact_solver, newton_kernel
 from dcc_jax.physics import scene as scenes
 from dcc_jax.physics.quiet_mjx import mjx
 from dcc_jax.physics.sparsity import arrow

@@ -33,10 +33,9 @@ from functools import partial
 import chex
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from dcc_jax import quat
-from dcc_jax.control import ranges
+from dcc_jax.control import admittance_kernel, ranges
 from dcc_jax.control.controller import Controller, Displacement, at_rest
 from dcc_jax.control.ranges import Room
 from dcc_jax.control.small_matrix import (
@@ -167,6 +166,9 @@ def admittance(
     """
     coords, dt = controller.coords, controller.dt
     chex.assert_shape(torque, (coords.nv,))
+    if room is not None and admittance_kernel.serves(controller, torque):
+        given = displacement, torque, jnp.asarray(alpha), room
+        return admittance_kernel.admittance(controller, *given)
     rest = yield_at_rest(controller, torque, alpha, room)
     _, share = _softening(controller, alpha, torque.dtype)
     yd = _sprung(controller, displacement.y - rest, displacement.yd)
@@ -230,8 +232,7 @@ def _softening(
     """
     W = jnp.asarray(controller.weights, dtype)
     by_u = W * alpha / (1.0 - alpha)
-    driven = np.arange(controller.coords.nv) >= controller.root_dofs
-    softer = by_u + driven
+    softer = by_u + controller.driven
     return softer, by_u / jnp.where(softer > 0.0, softer, 1.0)
 
 

@@ -80,6 +80,11 @@ class Controller:
         stiffness[: self.root_dofs] = self.config.root_return_stiffness
         return stiffness
 
+    @property
+    def driven(self) -> np.ndarray:
+        """Whether PD drives each degree of freedom [nv]: all but the root's."""
+        return np.arange(self.coords.nv) >= self.root_dofs
+
     def room(self, q_m: Array) -> Room | None:
         """What a reference q_m [nq] leaves of the joint ranges to u."""
         return None if self.ranges is None else self.ranges.room(self.coords, q_m)

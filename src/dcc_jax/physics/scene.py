@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from dcc_jax import native
 from dcc_jax.character import Character
-from dcc_jax.physics import native
 from dcc_jax.physics.kinematics_kernel import Tree
 from dcc_jax.physics.newton_kernel import Layout
 from dcc_jax.physics.quiet_mjx import mjx

@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from dcc_jax import quat
-from dcc_jax.physics import kinematics_kernel, native, newton_kernel
+from dcc_jax import native, quat
+from dcc_jax.physics import force_kernel, kinematics_kernel, newton_kernel
 from dcc_jax.physics.contact_solver import Rows, newton, solve_mass
 from dcc_jax.physics.quiet_mjx import mjx
 from dcc_jax.physics.scene import Scene
@@ -238,6 +238,10 @@ def generalized_force(
         force_w: N, world [F, 3].
     """
     data = kin.data
+    if data.cdof.dtype == jnp.float32 and native.available():
+        return force_kernel.generalized_force(
+            scene.model, data, point_w, jnp.asarray(body), force_w
+        )
     center_w = data.subtree_com[jnp.asarray(scene.mjx_model.body_rootid)[body]]
     wrench = jnp.concatenate([jnp.cross(point_w - center_w, force_w), force_w], axis=-1)
     moved = jnp.asarray(scene.moves)[body].astype(wrench.dtype)

@@ -1,7 +1,7 @@
 """The kernels for CPUs (`kernels/*.cc`): compiled at first use, called by XLA.
 
 They need a C++ compiler: `CXX`, `c++`, `g++` or `clang++`, or the pip package
-`ziglang`. Without one, and on every other device, physics goes on in JAX: the same
+`ziglang`. Without one, and on every other device, all goes on in JAX: the same
 result to single precision, more slowly, and compiled for longer. DCC_JAX_NATIVE=0 asks
 for it.
 """
@@ -27,7 +27,7 @@ from pathlib import Path
 import jax
 
 SOURCES = Path(__file__).with_name("kernels")
-TARGETS = "dcc_kinematics", "dcc_newton"
+TARGETS = "dcc_admittance", "dcc_force", "dcc_kinematics", "dcc_newton"
 SETTING = "DCC_JAX_NATIVE"
 FLAGS = (
     "-O3",

@@ -84,3 +84,32 @@ void to_matrix(const Q& q, M& m) {
   m[6] = 2.0f * (q[1] * q[3] - q[0] * q[2]);
   m[7] = 2.0f * (q[2] * q[3] + q[0] * q[1]);
 }
+
+// Sine and cosine of up to 2 rad, by those of the half: there the Taylor series are exact to
+// the last digit. Of more, one by one.
+inline void sine_cosine(V x, V& sine, V& cosine) {
+  const V half = 0.5f * x, z = half * half;
+  const V odd = z * (-1.0f / 6 + z * (1.0f / 120 + z * (-1.0f / 5040 +
+                     z * (1.0f / 362880 - z * (1.0f / 39916800)))));
+  const V s = half + half * odd;
+  const V even = z * (-1.0f / 2 + z * (1.0f / 24 + z * (-1.0f / 720 +
+                      z * (1.0f / 40320 - z * (1.0f / 3628800)))));
+  sine = 2.0f * s * (1.0f + even);
+  cosine = 1.0f - 2.0f * s * s;
+  const I far = z > 1.0f;
+  if (!any(far)) return;
+  for (int l = 0; l < kLanes; ++l)
+    if (far[l]) sine[l] = std::sin(x[l]), cosine[l] = std::cos(x[l]);
+}
+
+// Quaternion of a rotation vector.
+inline V4 exp_map(const V3& w) {
+  const V square = dot(w, w);
+  const I small = square < 1e-8f;
+  const V angle = square_root(choose(small, all(1.0f), square));
+  V sine, cosine;
+  sine_cosine(0.5f * angle, sine, cosine);
+  const V scale = choose(small, 0.5f - square * (1.0f / 48), sine / angle);
+  return {choose(small, 1.0f - square * 0.125f, cosine), scale * w[0], scale * w[1],
+          scale * w[2]};
+}
