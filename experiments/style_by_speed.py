@@ -74,8 +74,8 @@ def planned(
 ) -> Seen:
     """What blended strides look like along such paths."""
     strides = planner.strides(loops)
-    tables, velocity_time = environment.mechanics, environment.config.velocity_time
-    as_seen = partial(expert.of_pose, tables, velocity_time=velocity_time)
+    tables, weights = environment.mechanics, environment.weights
+    as_seen = partial(expert.of_pose, tables, weights=weights)
 
     def begun(at_key: Array, motion_key: Array) -> tuple[RefState, Motion]:
         at = planner.first_reference(at_key, loops, gaits, stands=False)

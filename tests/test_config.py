@@ -137,6 +137,7 @@ def test_numbers_of_numpy_become_pythons_own():
         ("ppo.activation", "step", r"ppo\.activation must be one of relu, .*'step'"),
         ("env.alpha_max", "x", r"env\.alpha_max must be a number or none, got 'x'"),
         ("env", 3, r"env must be .*EnvConfig, got 3"),
+        ("env.turn_arm", 0.0, r"env\.turn_arm must be positive, got 0\.0"),
         ("env.velocity_time", 0.0, r"env\.velocity_time must be positive, got 0\.0"),
         ("preset", "gpu", "preset .* cannot be changed"),
     ],

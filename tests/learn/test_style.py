@@ -11,12 +11,19 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from dcc_jax.env.pairs import COLUMN_ARM, VELOCITY_TIME, pair_coordinates, seen, weighed
+from dcc_jax.env.pairs import (
+    COLUMN_ARM,
+    VELOCITY_TIME,
+    Weights,
+    pair_coordinates,
+    seen,
+    weighed,
+)
 from dcc_jax.learn import style
 from toy import Toy
 
 DT = 1.0 / 30.0
-TIME = 0.05  # s, as velocities count
+WEIGHTS = Weights(velocity_time=0.05, turn_arm=0.3)
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +104,7 @@ def _features(
     turn = np.broadcast_to(columns, (15, 6))
     velocity = (position - before) / DT
     bodies = np.concatenate([position, velocity, turn, np.zeros((15, 6))], 1).ravel()
-    return seen(jnp.array(bodies), jnp.array(sliding), TIME)
+    return seen(jnp.array(bodies), jnp.array(sliding), WEIGHTS)
 
 
 def test_pair_moved_as_a_whole_is_as_far_away():
@@ -106,7 +113,9 @@ def test_pair_moved_as_a_whole_is_as_far_away():
     here = _features(at, at, turn)
     moved = at + np.array([0.0, 0.03, 0.04])
     aside = _features(moved, moved, turn)
-    gap = pair_coordinates(here, here, TIME) - pair_coordinates(aside, aside, TIME)
+    gap = pair_coordinates(here, here, WEIGHTS) - pair_coordinates(
+        aside, aside, WEIGHTS
+    )
     assert gap.shape == (225,)
     assert float(jnp.linalg.norm(gap)) == pytest.approx(0.05, rel=1e-4)
 
@@ -116,33 +125,34 @@ def test_speed_and_turn_count_as_the_constants_say():
     rest = _features(at, at, turn)
     moving = _features(at, at - [DT, 0.0, 0.0], turn)  # 1 m/s
     turned = _features(at, at, np.eye(6)[0])
-    standing = pair_coordinates(rest, rest, TIME)
+    standing = pair_coordinates(rest, rest, WEIGHTS)
     for pair, expected in (
         ((rest, moving), VELOCITY_TIME),
         ((moving, rest), VELOCITY_TIME),
         ((rest, turned), COLUMN_ARM),
     ):
-        gap = pair_coordinates(*pair, TIME) - standing
+        gap = pair_coordinates(*pair, WEIGHTS) - standing
         assert float(jnp.linalg.norm(gap)) == pytest.approx(expected, rel=1e-4)
 
 
-def test_a_velocity_weighs_as_much_as_the_way_it_makes_in_that_time():
+def test_velocities_and_turns_weigh_as_much_as_the_ways_they_make():
     bodies = np.ones((2, 15, 18), np.float32)
-    values = np.asarray(weighed(jnp.array(bodies.reshape(2, 270)), TIME))
+    values = np.asarray(weighed(jnp.array(bodies.reshape(2, 270)), WEIGHTS))
     pos, velocity, columns, rate = np.split(
         values.reshape(2, 15, 18), [3, 6, 12], axis=2
     )
-    assert np.all(pos == 1.0) and np.all(columns == 1.0)
-    np.testing.assert_allclose(velocity, TIME)
-    np.testing.assert_allclose(rate, TIME)
+    assert np.all(pos == 1.0)
+    np.testing.assert_allclose(velocity, 0.05)
+    np.testing.assert_allclose(columns, 0.3)
+    np.testing.assert_allclose(rate, 0.3 * 0.05)
 
 
 def test_sliding_soles_are_seen_and_are_no_distance():
     at, turn = np.zeros((15, 3)), np.zeros(6)
     still, slides = _features(at, at, turn), _features(at, at, turn, (0.2, 0.1))
     np.testing.assert_allclose(slides - still, [*[0.0] * 270, 0.2, 0.1], atol=1e-7)
-    one = pair_coordinates(still, still, TIME)
-    np.testing.assert_array_equal(pair_coordinates(slides, slides, TIME), one)
+    one = pair_coordinates(still, still, WEIGHTS)
+    np.testing.assert_array_equal(pair_coordinates(slides, slides, WEIGHTS), one)
 
 
 def test_floor_is_the_distance_of_other_pairs_of_the_clips(reference):

@@ -72,6 +72,11 @@ class EnvConfig:
     """s; 1 m/s counts as much as this many m in what the discriminator sees. A small
     one hides how the feet slide, a large one lets it see the noise of exploration."""
 
+    turn_arm: float = 1.0
+    """m; an entry of a body's two columns, which have length 1, counts as much as this
+    many m in what the discriminator sees. The hand of an arm that turns is as far away
+    as the arm is long."""
+
     compliance: ComplianceConfig = field(default_factory=ComplianceConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
 
@@ -88,10 +93,11 @@ class EnvConfig:
                 raise ValueError(
                     f"env.alpha_max must be at least alpha, got {self.alpha_max}"
                 )
-        if not 0.0 < self.velocity_time < math.inf:
-            raise ValueError(
-                f"env.velocity_time must be positive, got {self.velocity_time}"
-            )
+        for name in ("velocity_time", "turn_arm"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise ValueError(
+                    f"env.{name} must be positive, got {getattr(self, name)}"
+                )
         if not self.episode_seconds > 0.1:
             raise ValueError(
                 f"env.episode_seconds must be more than 0.1, got {self.episode_seconds}"

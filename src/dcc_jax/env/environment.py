@@ -86,6 +86,7 @@ class Environment:
         self.action_size = character.num_joint_dofs + task.extra_actions
         self.observation_size = observation.size(task, self.has_phase, self.has_pose)
         self.feature_size = pairs.SEEN_SIZE
+        self.weights = pairs.Weights(config.velocity_time, config.turn_arm)
         self.has_task_reward = task.has_reward
         # Traced once, however many programs have it.
         self._reset = jax.jit(self._begun)
@@ -225,7 +226,7 @@ class Environment:
         """(s, s') ~ M, `spans` [n] control steps apart: what the discriminator sees
         [n, 272] twice, and the condition [n, C]."""
         s, s_next, phase = expert.pairs(
-            self.mechanics, self.references, key, spans, self.config.velocity_time
+            self.mechanics, self.references, key, spans, self.weights
         )
         condition = jax.vmap(observation.of_phase)(phase)
         return s, s_next, condition[:, : self.condition_size]
@@ -241,7 +242,7 @@ class Environment:
 
     def style_coordinates(self, s: Array, s_next: Array) -> Array:
         """Pairs of what is seen [..., 272] as points [..., 225] in m."""
-        return pairs.pair_coordinates(s, s_next, self.config.velocity_time)
+        return pairs.pair_coordinates(s, s_next, self.weights)
 
     def _drawn(self, key: Array, place_key: Array) -> tuple[RefState, RefState]:
         """The moment of the reference an episode begins at, and the start beside it."""
@@ -313,7 +314,7 @@ class Environment:
         )
         # Soles must not slide, however far the pose gives way: q, not q (-) u.
         sliding = mechanics.sliding(self.mechanics, q, before)
-        seen = pairs.seen(bodies, sliding, self.config.velocity_time)
+        seen = pairs.seen(bodies, sliding, self.weights)
         first = state.time == 0.0
         return dataclasses.replace(
             state,

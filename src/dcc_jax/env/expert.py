@@ -14,7 +14,7 @@ from dcc_jax.character import Character
 from dcc_jax.env import features, mechanics
 from dcc_jax.env.features import Kinematics
 from dcc_jax.env.mechanics import Mechanics
-from dcc_jax.env.pairs import seen
+from dcc_jax.env.pairs import Weights, seen
 from dcc_jax.motion.reference import References
 
 Array = jax.Array
@@ -25,31 +25,29 @@ def pairs(
     references: References,
     key: Array,
     spans: Array,
-    velocity_time: float,
+    weights: Weights,
 ) -> tuple[Array, Array, Array]:
     """(s, s') ~ M: what is `seen` [n, 272] of clips, now and `spans` [n] control steps
     later, and the clip's phase [n] then."""
     windows, phase = references.sample_windows(key, spans)
 
     before, q = windows[:, 0::2], windows[:, 1::2]  # [n, 2, 55]: of s and of s'
-    of_both = jax.vmap(jax.vmap(lambda q, q0: of_pose(tables, q, q0, velocity_time)))
+    of_both = jax.vmap(jax.vmap(lambda q, q0: of_pose(tables, q, q0, weights)))
     both = of_both(q, before)
     return both[:, 0], both[:, 1], phase
 
 
-def of_pose(
-    tables: Mechanics, q: Array, q_previous: Array, velocity_time: float
-) -> Array:
+def of_pose(tables: Mechanics, q: Array, q_previous: Array, weights: Weights) -> Array:
     """What is `seen` [272] of a pose of a clip, which nothing displaces.
 
     Args:
         tables: of the character.
         q: now [55], its height above the ground.
         q_previous: the same, one control step ago.
-        velocity_time: of `pairs.weighed`, s.
+        weights: of `pairs.weighed`.
     """
     bodies = features.body_features(tables.kinematics, q, q_previous)
-    return seen(bodies, mechanics.sliding(tables, q, q_previous), velocity_time)
+    return seen(bodies, mechanics.sliding(tables, q, q_previous), weights)
 
 
 def lead(character: Character, control_dt: float) -> float:

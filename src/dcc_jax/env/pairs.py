@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +20,15 @@ SEEN_SIZE = FEATURE_SIZE + len(FEET)
 """Numbers that the discriminator sees of a state, 272."""
 
 
-def seen(bodies: Array, sliding: Array, velocity_time: float) -> Array:
+@dataclass(frozen=True)
+class Weights:
+    """How much each kind of number counts beside a position in m."""
+
+    velocity_time: float  # s; 1 m/s counts as much as this many m
+    turn_arm: float  # m; an entry of a column, of length 1, counts as much
+
+
+def seen(bodies: Array, sliding: Array, weights: Weights) -> Array:
     """What the discriminator sees of a state, [..., 272].
 
     Departure: the paper has the bodies alone. There a sole that slides at 10 cm/s is
@@ -27,23 +37,24 @@ def seen(bodies: Array, sliding: Array, velocity_time: float) -> Array:
     Args:
         bodies: `body_features` [..., 270].
         sliding: of both feet, `mechanics.sliding` [..., 2] m/s.
-        velocity_time: of `weighed`, s.
+        weights: of `weighed`.
     """
-    return jnp.concatenate([weighed(bodies, velocity_time), sliding], axis=-1)
+    return jnp.concatenate([weighed(bodies, weights), sliding], axis=-1)
 
 
-def weighed(bodies: Array, velocity_time: float) -> Array:
-    """`body_features` [..., 270] with velocities and rates times `velocity_time`.
+def weighed(bodies: Array, weights: Weights) -> Array:
+    """`body_features` [..., 270] as lengths in m, by the weights.
 
     Args:
         bodies: [..., 270].
-        velocity_time: s, 1 m/s counts as much as this many m.
+        weights: of velocities, of columns, and of both for rates.
     """
-    one = np.repeat([1.0, velocity_time, 1.0, velocity_time], [3, 3, 6, 6])
+    time, arm = weights.velocity_time, weights.turn_arm
+    one = np.repeat([1.0, time, arm, arm * time], [3, 3, 6, 6])
     return bodies * jnp.asarray(np.tile(one, len(BODIES)), bodies.dtype)
 
 
-def pair_coordinates(s: Array, s_next: Array, velocity_time: float) -> Array:
+def pair_coordinates(s: Array, s_next: Array, weights: Weights) -> Array:
     """A pair of what is `seen` as a point [..., 225] in m, by Euclidean distance.
 
     A body contributes its position, its two columns times `COLUMN_ARM`, and its
@@ -53,7 +64,7 @@ def pair_coordinates(s: Array, s_next: Array, velocity_time: float) -> Array:
     Args:
         s: [..., 272] of `seen`; how the soles slide is left out.
         s_next: [..., 272], a control step later.
-        velocity_time: of both, s.
+        weights: of both.
     """
     before, now = (
         x[..., :FEATURE_SIZE].reshape(*x.shape[:-1], -1, BODY_FEATURE_SIZE)
@@ -61,9 +72,9 @@ def pair_coordinates(s: Array, s_next: Array, velocity_time: float) -> Array:
     )
     parts = [
         now[..., 0:3],
-        COLUMN_ARM * now[..., 6:12],
-        VELOCITY_TIME / velocity_time * now[..., 3:6],
-        VELOCITY_TIME / velocity_time * before[..., 3:6],
+        COLUMN_ARM / weights.turn_arm * now[..., 6:12],
+        VELOCITY_TIME / weights.velocity_time * now[..., 3:6],
+        VELOCITY_TIME / weights.velocity_time * before[..., 3:6],
     ]
     points = jnp.concatenate(parts, axis=-1) / np.sqrt(now.shape[-2])
     return points.reshape(*points.shape[:-2], -1)
