@@ -192,3 +192,20 @@ def test_in_a_fluid_physics_is_mjxs(character: Character):
     state = physics.initial_state(scene, jnp.asarray(model.qpos0, jnp.float32), zero)
     program = jax.make_jaxpr(lambda: physics.kinematics(scene, state))()
     assert "ffi_call" not in str(program)
+
+
+def test_a_body_that_is_turned_by_very_little_is_turned():
+    """Its real part is 1 in single precision."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body quat='1 0 0 1e-4'><freejoint/><geom size='.1'/>
+        <body quat='1 0 0 1e-4'><body pos='1 0 0'><geom size='.1'/></body></body>
+        </body></worldbody></mujoco>"""
+    )
+    device = mjx.put_model(model)
+    template = mjx.make_data(device)
+    tree = Tree.of(model, scenes._contacts(device, template))
+    data = jax.jit(lambda: kinematics_kernel.kinematics(tree, template))()
+    there = mujoco.MjData(model)
+    mujoco.mj_forward(model, there)
+    np.testing.assert_allclose(data.xpos, there.xpos, atol=1e-6)
+    assert abs(there.xpos[-1, 1]) > 3e-4

@@ -125,7 +125,7 @@ struct Reader {
     next(out.pos, 3);
     next(out.quat, 4);
     to_matrix(out.quat, out.mat);
-    out.turned = out.quat[0] != 1.0f;
+    out.turned = out.quat[1] || out.quat[2] || out.quat[3];
     return out;
   }
 };
