@@ -9,6 +9,7 @@ import pytest
 from dcc_jax.learn import learner
 from dcc_jax.learn.ppo import PpoConfig
 from dcc_jax.learn.state import TrainConfig
+from dcc_jax.learn.update import chunk_size
 from toy import ToyConfig
 
 
@@ -83,7 +84,7 @@ def test_environments_of_two_devices_differ(compiled, first_state):
 @pytest.mark.parametrize(
     ("section", "values", "message"),
     [
-        ("ppo", {"minibatch_size": 100}, r"ppo\.minibatch_size must divide the 512"),
+        ("ppo", {"minibatch_size": 100}, r"must divide the 512 .* a multiple of 25;"),
         ("disc", {"minibatch_size": 7}, r"disc\.minibatch_size must be a multiple"),
         ("train", {"chunk_size": 3}, r"train\.chunk_size must divide the 16"),
     ],
@@ -93,6 +94,16 @@ def test_sizes_that_do_not_come_out_even_are_named(section, values, message):
     part = dataclasses.replace(getattr(config, section), **values)
     with pytest.raises(ValueError, match=message):
         learner.check_sizes(dataclasses.replace(config, **{section: part}), devices=2)
+
+
+@pytest.mark.parametrize(
+    ("environments", "chunk"),
+    [(16, 16), (128, 128), (200, 100), (4096, 128), (257, 257)],
+)
+def test_a_cpu_steps_as_many_at_once_as_come_out_even(environments, chunk):
+    if jax.default_backend() != "cpu":
+        pytest.skip("elsewhere all are stepped at once")
+    assert chunk_size(TrainConfig(), environments) == chunk
 
 
 def test_environments_that_devices_cannot_share_are_refused():

@@ -5,6 +5,7 @@ Letters: R runs of a sweep, D devices.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -34,11 +35,7 @@ def make_mesh(config: TrainConfig, devices: int | None = None) -> Mesh:
         ValueError: the devices cannot share the environments equally.
     """
     count = len(jax.devices()) if devices is None else devices
-    if config.num_envs % count:
-        raise ValueError(
-            f"train.num_envs must be a multiple of the {count} devices, "
-            f"got {config.num_envs}"
-        )
+    _check_multiple("train.num_envs", config.num_envs, count)
     return jax.make_mesh((count,), (AXIS,), devices=jax.devices()[:count])
 
 
@@ -47,11 +44,13 @@ def check_sizes(config: LearnerConfig, devices: int) -> None:
     local_envs = config.train.num_envs // devices
     _check_multiple("ppo.minibatch_size", config.ppo.minibatch_size, devices)
     _check_multiple("disc.minibatch_size", config.disc.minibatch_size, devices)
-    tuples = config.train.tuples_per_update
-    if tuples % config.ppo.minibatch_size:
+    tuples, size = config.train.tuples_per_update, config.ppo.minibatch_size
+    if tuples % size:
+        fits = size // math.gcd(size, config.train.unroll_length)
         raise ValueError(
             f"ppo.minibatch_size must divide the {tuples} tuples of an update "
-            f"(train.num_envs x train.unroll_length), got {config.ppo.minibatch_size}"
+            f"(train.num_envs x train.unroll_length), as with a train.num_envs that is "
+            f"a multiple of {fits}; got {size}"
         )
     chunk = chunk_size(config.train, local_envs)
     if chunk is not None and local_envs % chunk:
@@ -140,6 +139,8 @@ def _state_specs(runs: bool) -> TrainState:
 
 def _check_multiple(name: str, value: int, devices: int) -> None:
     if value % devices:
+        larger = value + devices - value % devices
         raise ValueError(
-            f"{name} must be a multiple of the {devices} devices, got {value}"
+            f"{name} must be a multiple of the {devices} devices, as {larger} is, "
+            f"got {value}"
         )

@@ -277,5 +277,7 @@ def chunk_size(config: TrainConfig, local_envs: int) -> int | None:
     """Environments that a device steps at once, or None for all of them."""
     if config.chunk_size is not None:
         return min(config.chunk_size, local_envs)
-    on_cpu = jax.default_backend() == "cpu"
-    return min(_CPU_CHUNK, local_envs) if on_cpu else None
+    if jax.default_backend() != "cpu":
+        return None
+    even = [n for n in range(_CPU_CHUNK // 4, _CPU_CHUNK + 1) if local_envs % n == 0]
+    return max(even, default=local_envs)
