@@ -34,8 +34,6 @@ LEVERS: dict[str, dict[str, Any]] = {
     "penalty 10, no instance noise": OPEN,
     "exploration 6 degrees": {"ppo.sigma_degrees": 6.0},
     "KL divergence 0.01": {"ppo.target_kl": 0.01},
-    "exploration remembers 0.5": {"ppo.noise_memory": 0.5},
-    "exploration remembers 0.8": {"ppo.noise_memory": 0.8},
     "the last update's policy": {"train.averaged_updates": 1},
     "pairs 3 steps apart": {"disc.span": 3},
     "pairs 10 steps apart": {"disc.span": 10},

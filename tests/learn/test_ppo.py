@@ -127,13 +127,3 @@ def test_first_policy_hardly_offsets_the_pose():
 def test_value_out_of_range_is_named(name, value):
     with pytest.raises(ValueError, match=rf"ppo\.{name} must be .*, got"):
         ppo.PpoConfig(**{name: value})
-
-
-def test_noise_that_remembers_has_the_same_variance_and_a_correlation():
-    white = jax.random.normal(jax.random.key(0), (16, 20000))
-    noise = np.asarray(ppo.remembering(white, 0.8))
-    np.testing.assert_allclose(noise.var(axis=1), 1.0, atol=0.05)
-    for apart in (1, 3):
-        correlation = np.mean(noise[apart:] * noise[:-apart])
-        assert correlation == pytest.approx(0.8**apart, abs=0.02)
-    assert ppo.remembering(white, 0.0) is white

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import flax.struct
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from dcc_jax.learn import networks
 from dcc_jax.learn.exchange import mean_tree
@@ -32,11 +31,6 @@ class PpoConfig:
 
     sigma_degrees: float = 6.0
     """Standard deviation of every action (Sec. 5.1)."""
-
-    noise_memory: float = 0.0
-    """Correlation of the exploration of two consecutive control steps. None, as in the
-    paper, is a tremble. With some, log probabilities go on being those of single steps
-    (Hollenstein 2024)."""
 
     discount: float = 0.95
     """gamma of Eq. (9) (Sec. 5.1)."""
@@ -74,8 +68,6 @@ class PpoConfig:
         for name in ("discount", "gae_lambda"):
             value = getattr(self, name)
             _require(0 <= value <= 1, name, value, "between 0 and 1")
-        memory = self.noise_memory
-        _require(0 <= memory < 1, "noise_memory", memory, "0 or more and below 1")
         for name in ("minibatch_size", "epochs"):
             _require(getattr(self, name) >= 1, name, getattr(self, name), "1 or more")
         kl = self.target_kl
@@ -90,17 +82,6 @@ class PpoConfig:
     def sigma(self) -> float:
         """Standard deviation of every action, rad."""
         return math.radians(self.sigma_degrees)
-
-
-def remembering(noise: Array, memory: float) -> Array:
-    """White noise [T, ...] as noise of the same variance whose entries t steps apart
-    have the correlation memory^t (a first-order autoregression)."""
-    if memory == 0.0:
-        return noise
-    t = np.arange(noise.shape[0])
-    correlation = memory ** np.abs(t[:, None] - t).astype(float)
-    mixed = jnp.asarray(np.linalg.cholesky(correlation), noise.dtype)
-    return jnp.tensordot(mixed, noise, axes=1)
 
 
 @flax.struct.dataclass

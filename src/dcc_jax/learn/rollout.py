@@ -146,7 +146,7 @@ def rollout(
             the working set stays in a CPU's cache. None: all.
     """
     count = running.steps.shape[0]
-    draws = _draws(key, length, running, environment, config.noise_memory)
+    draws = _draws(key, length, running, environment)
     if chunk is None or chunk >= count:
         return _rollout(draws, environment, actors, running, config)
     chunks = count // chunk
@@ -200,17 +200,12 @@ def _rollout(
 
 
 def _draws(
-    key: Array,
-    length: int,
-    running: Running,
-    environment: Environment,
-    memory: float,
+    key: Array, length: int, running: Running, environment: Environment
 ) -> tuple[Array, Array, Array]:
     """Action noise [T, B, A], step keys and reset keys [T, B], all drawn at once."""
     count = running.steps.shape[0]
     noise_key, step_key, reset_key = jax.random.split(key, 3)
     noise = jax.random.normal(noise_key, (length, count, environment.action_size))
-    noise = ppo.remembering(noise, memory)
     step_keys = jax.random.split(step_key, (length, count))
     return noise, step_keys, jax.random.split(reset_key, (length, count))
 
