@@ -44,6 +44,7 @@ LEVERS: dict[str, dict[str, Any]] = {
     "turns as 0.1 m, penalty 10": {"env.turn_arm": 0.1, "disc.gradient_penalty": 10.0},
     "turns as 0.1 m, noise 0.1": {"env.turn_arm": 0.1, "disc.instance_noise": 0.1},
     "turns as 0.1 m, floor 0.03": {"env.turn_arm": 0.1, "disc.feature_floor": 0.03},
+    "turns as 0.1 m, floor 0.01": {"env.turn_arm": 0.1, "disc.feature_floor": 0.01},
     "turns as 0.3 m, penalty 20": {"env.turn_arm": 0.3, "disc.gradient_penalty": 20.0},
     "4 minibatches": {"disc.minibatches": 4},
     "learning rate 3e-5": {"disc.learning_rate": 3e-5},
