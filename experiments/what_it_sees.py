@@ -87,13 +87,12 @@ def policy_pairs(run: Run, state: TrainState, degrees: float, steps: int) -> Pai
 def judged(run: Run, state: TrainState, sets: dict[str, Array]) -> str:
     """The first table, of inputs [N, W] by name; the clips' are the first."""
     lines = ["| | score | judged right | balanced | r_q |", "|---|--:|--:|--:|--:|"]
-    of_clips = 0.0
+    of_clips = None
     for name, x in sets.items():
         score = discriminator.score(state.disc.params, x)
-        clips = not of_clips
-        right = float(jnp.mean((score > 0.0) == clips))
-        of_clips = of_clips or right
-        balanced = "-" if clips else f"{0.5 * (right + of_clips):.0%}"
+        right = float(jnp.mean((score > 0.0) == (of_clips is None)))
+        balanced = "-" if of_clips is None else f"{0.5 * (right + of_clips):.0%}"
+        of_clips = right if of_clips is None else of_clips
         r_q = float(jnp.mean(rewards.pose_reward(score, run.config.env.reward)))
         mean = float(jnp.mean(score))
         lines.append(f"| {name} | {mean:.2f} | {right:.0%} | {balanced} | {r_q:.2f} |")

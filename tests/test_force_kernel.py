@@ -73,3 +73,14 @@ def test_an_environment_is_the_same_to_the_bit_wherever_it_is(scene, given):
         np.testing.assert_array_equal(
             pulled(scene, *(x[first:] for x in given)), whole[first:]
         )
+
+
+def test_who_is_not_pulled_has_no_force_whoever_is_beside(scene, given):
+    """Not even where a state is not a number; it stays there."""
+    qpos, point, body, force = given
+    force = force.at[20].set(0.0).at[21].set(100.0)
+    clean = pulled(scene, qpos, point, body, force)
+    qpos, point = qpos.at[20].set(jnp.nan), point.at[20].set(jnp.nan)
+    spoiled = pulled(scene, qpos, point, body, force)
+    np.testing.assert_array_equal(spoiled, clean)
+    assert not spoiled[20].any() and spoiled[21].any()

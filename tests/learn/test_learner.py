@@ -84,7 +84,7 @@ def test_environments_of_two_devices_differ(compiled, first_state):
 @pytest.mark.parametrize(
     ("section", "values", "message"),
     [
-        ("ppo", {"minibatch_size": 100}, r"must divide the 512 .* a multiple of 25;"),
+        ("ppo", {"minibatch_size": 100}, r"must divide the 512 .* a multiple of 50;"),
         ("disc", {"minibatch_size": 7}, r"disc\.minibatch_size must be a multiple"),
         ("train", {"chunk_size": 3}, r"train\.chunk_size must divide the 16"),
     ],

@@ -6,6 +6,7 @@ many small operations, which cost several times as much.
 
 from __future__ import annotations
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,7 +34,11 @@ def admittance(
     room: Room,
 ) -> Displacement:
     """`compliance.admittance` of one environment; a batch by `vmap`."""
-    before = displacement
+    before, coords = displacement, controller.coords
+    chex.assert_shape(before.u, (coords.nq,))
+    chex.assert_shape([torque, before.ud, before.y, before.yd], (coords.nv,))
+    chex.assert_shape(alpha, ())
+    chex.assert_shape(room.pose, (len(room.r), 4))
     call = jax.ffi.ffi_call(
         "dcc_admittance",
         [

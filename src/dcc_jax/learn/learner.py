@@ -47,6 +47,7 @@ def check_sizes(config: LearnerConfig, devices: int) -> None:
     tuples, size = config.train.tuples_per_update, config.ppo.minibatch_size
     if tuples % size:
         fits = size // math.gcd(size, config.train.unroll_length)
+        fits = math.lcm(fits, devices)
         raise ValueError(
             f"ppo.minibatch_size must divide the {tuples} tuples of an update "
             f"(train.num_envs x train.unroll_length), as with a train.num_envs that is "

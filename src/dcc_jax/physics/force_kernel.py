@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import chex
 import jax
 import mujoco
 import numpy as np
@@ -19,6 +20,8 @@ def generalized_force(
     Where no force acts in a whole vector register of environments, nothing is
     calculated: most balls of `push` are in flight.
     """
+    chex.assert_equal_shape([point_w, force_w])
+    chex.assert_shape(force_w, (*body.shape, 3))
     call = jax.ffi.ffi_call(
         "dcc_force",
         jax.ShapeDtypeStruct((model.nv,), np.float32),
@@ -32,5 +35,4 @@ def generalized_force(
         data.subtree_com,
         data.cdof,
         structure=np.concatenate([[model.nv, model.nbody], *tree]).astype(np.int32),
-        numbers=np.zeros(0, np.float32),
     )
