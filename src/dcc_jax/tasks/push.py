@@ -50,7 +50,11 @@ class Push(Task):
         *(f"recover_{angle:03d}" for angle in range(0, 360, 45)),
     )
     state_size: ClassVar[int] = 6
-    config_overrides: ClassVar[Mapping[str, Any]] = {"ppo.sigma_degrees": 3.0}
+    config_overrides: ClassVar[Mapping[str, Any]] = {
+        "ppo.sigma_degrees": 3.0,
+        "env.turn_arm": 0.1,
+        "disc.feature_floor": 0.01,
+    }
     event: ClassVar[Event | None] = Event("throw a ball", "next_throw")
     clock: ClassVar[str | None] = "since_throw"
 
