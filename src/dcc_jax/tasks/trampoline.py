@@ -56,6 +56,8 @@ class Trampoline(Task):
     config_overrides: ClassVar[Mapping[str, Any]] = {
         "ppo.sigma_degrees": 3.0,
         "env.velocity_time": 0.1,
+        "env.turn_arm": 0.1,
+        "disc.feature_floor": 0.03,
     }
     """docs/skills/trampoline.md compares them."""
 
