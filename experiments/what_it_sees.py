@@ -63,7 +63,7 @@ def restored(run: Run, folder: Path) -> TrainState:
     template = jax.eval_shape(init, jax.random.key(0), None)
     found = checkpoint.restore_latest(folder, template, lambda text: print(text))
     if found is None:
-        raise ValueError(f"there is no checkpoint in {folder}")
+        raise ValueError(f"{folder} has no checkpoint; policies that ship have none")
     return jax.tree.map(jnp.asarray, found[1])
 
 
@@ -118,6 +118,8 @@ def main() -> None:
     parser.add_argument("run", type=Path, metavar="RUN_DIR")
     parser.add_argument("--steps", type=int, default=60, help="control steps (60)")
     options = parser.parse_args()
+    if options.steps < 1:
+        parser.error(f"--steps must be 1 or more, got {options.steps}")
     run = find_run(options.run)
     state = restored(run, options.run)
     config, normal = run.config, state.feature_normalizer

@@ -74,8 +74,8 @@ class EnvConfig:
 
     turn_arm: float = 1.0
     """m; an entry of a body's two columns, which have length 1, counts as much as this
-    many m in what the discriminator sees. The hand of an arm that turns is as far away
-    as the arm is long."""
+    many m in what the discriminator sees. What varies by more than
+    `disc.feature_floor` is divided by how much it varies, whatever it counts as."""
 
     compliance: ComplianceConfig = field(default_factory=ComplianceConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
