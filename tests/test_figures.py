@@ -15,8 +15,10 @@ from matplotlib.image import imread
 
 import dcc_jax
 from dcc_jax.character import asset_path
+from dcc_jax.env.pairs import SEEN_SIZE
 from dcc_jax.evaluate import bootstrap, compare
 from dcc_jax.evaluate.compare import Condition, Part
+from dcc_jax.learn import discriminator, networks
 from dcc_jax.motion import planner
 from dcc_jax.motion.clip import load_clip
 from dcc_jax.motion.paths import Gaits
@@ -264,3 +266,28 @@ def test_steady_strides_of_the_planner_are_the_clips():
     assert by_speed.distances(environment, (0.9 * points, speed, up)).min() > 25.0
     fallen = (points, speed, up.at[10:].set(False))
     assert np.isnan(by_speed.distances(environment, fallen)[10:]).all()
+
+
+def test_parts_of_a_score_add_up_to_it():
+    """Of a discriminator with random weights, and of pairs at random."""
+    sees = importlib.import_module("what_it_sees")
+    keys = jax.random.split(jax.random.key(0), 3)
+    net = networks.init_mlp(keys[0], (2 * SEEN_SIZE, 32, 32, 1), activation="tanh")
+    policy = 0.2 * jax.random.normal(keys[1], (40, 2 * SEEN_SIZE))
+    clips = 0.1 * jax.random.normal(keys[2], (60, 2 * SEEN_SIZE))
+    state = SimpleNamespace(disc=SimpleNamespace(params=net))
+    found = sees.parts(state, policy, clips)
+    apart = np.linalg.norm(np.asarray(policy)[:, None] - np.asarray(clips), axis=-1)
+    near = clips[apart.argmin(axis=1)]
+    expected = np.mean(
+        discriminator.score(net, near) - discriminator.score(net, policy)
+    )
+    assert sum(found.values()) == pytest.approx(float(expected), rel=1e-3)
+    assert list(found) == [*sees.KINDS, "sliding soles"]
+    # Numbers of one kind alone are that kind's.
+    columns = np.zeros((2, SEEN_SIZE), bool)
+    columns[:, :270] = np.tile(np.arange(18) // 6 == 1, 15)
+    alone = np.where(columns.ravel(), np.asarray(policy), np.asarray(clips)[0])
+    only = sees.parts(state, jax.numpy.asarray(alone), clips[:1])
+    assert only["columns"] != 0.0
+    assert all(value == 0.0 for name, value in only.items() if name != "columns")
