@@ -139,7 +139,7 @@ def _task(kind: type[Task]) -> str:
     ]
     own = [f"`{name}` = {_shown(x)}" for name, x in kind.config_overrides.items()]
     if own:
-        parts.append(f"Trains with {', '.join(own)}.")
+        parts.append(f"Trains with {', '.join(own)} (presets `cpu` and `gpu`).")
     return "\n\n".join(parts)
 
 
