@@ -28,6 +28,7 @@ import numpy as np
 
 from dcc_jax.character import BODIES
 from dcc_jax.env import rewards
+from dcc_jax.env.environment import Environment
 from dcc_jax.env.features import BODY_FEATURE_SIZE, FEATURE_SIZE
 from dcc_jax.env.pairs import SEEN_SIZE
 from dcc_jax.learn import discriminator, learner
@@ -49,13 +50,12 @@ KINDS = {
 """Of a body's numbers."""
 
 
-def restored(run: Run, folder: Path) -> TrainState:
+def restored(run: Run, environment: Environment, folder: Path) -> TrainState:
     """The last checkpoint of a run.
 
     Raises:
         ValueError: there is none, or the run has no discriminator.
     """
-    environment = make_environment(run)
     if environment.tracks_reference:
         raise ValueError(f"{folder} was taught by tracking: it has no discriminator")
     mesh = learner.make_mesh(run.config.train, devices=1)
@@ -67,9 +67,10 @@ def restored(run: Run, folder: Path) -> TrainState:
     return jax.tree.map(jnp.asarray, found[1])
 
 
-def policy_pairs(run: Run, state: TrainState, degrees: float, steps: int) -> Pairs:
-    """What the policy does with so much exploration, [COUNT, ...], after a second."""
-    environment = make_environment(run)
+def policy_pairs(
+    run: Run, environment: Environment, state: TrainState, degrees: float, steps: int
+) -> Pairs:
+    """What the policy does with so much exploration, [COUNT, ...], after as long."""
     actors = Actors(run.policy, state.agent.value.params, None)
     ppo = replace(run.config.ppo, sigma_degrees=degrees)
     act = jax.jit(
@@ -121,17 +122,15 @@ def main() -> None:
     if options.steps < 1:
         parser.error(f"--steps must be 1 or more, got {options.steps}")
     run = find_run(options.run)
-    state = restored(run, options.run)
+    environment = make_environment(run)
+    state = restored(run, environment, options.run)
     config, normal = run.config, state.feature_normalizer
     spans = jnp.full(COUNT, config.disc.span, jnp.int32)
-    environment = make_environment(run)
-    shown = {
-        "clips": Pairs(*environment.expert_pairs(jax.random.key(1), spans)),
-        "the mean action": policy_pairs(run, state, STILL, options.steps),
-        "with exploration": policy_pairs(
-            run, state, config.ppo.sigma_degrees, options.steps
-        ),
-    }
+    shown = {"clips": Pairs(*environment.expert_pairs(jax.random.key(1), spans))}
+    explored = {"the mean action": STILL, "with exploration": config.ppo.sigma_degrees}
+    for name, degrees in explored.items():
+        given = run, environment, state, degrees
+        shown[name] = policy_pairs(*given, options.steps)
     sets = {
         name: discriminator.inputs(normal, pairs, config.disc)
         for name, pairs in shown.items()

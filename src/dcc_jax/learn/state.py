@@ -38,7 +38,8 @@ class TrainConfig:
     (Sec. 5.1)."""
 
     chunk_size: int | None = None
-    """Environments that a device steps at once; None: 128 on a CPU, all elsewhere."""
+    """Environments that a device steps at once; None: as many up to 128 as come out
+    even on a CPU, all elsewhere."""
 
     total_tuples: int = 20_000_000
     """Training ends after as many (s, a, r, s'); the paper has 20-80 M (Sec. 5.1)."""
